@@ -1,0 +1,1 @@
+"""Learned particle simulators: data, models, training, rollout, comparison. Never imports taichi."""

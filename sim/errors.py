@@ -1,0 +1,15 @@
+"""The one exception type that a user's own mistake raises; command lines print it as one line and exit with 2."""
+
+
+class InputError(ValueError):
+    """A mistake in what the user gave: names the file, the key, the value and the remedy in one line."""
+
+    def __init__(self, where: object, key: str, value: object, remedy: str):
+        shown = repr(value)
+        if len(shown) > 120:
+            shown = shown[:117] + "..."
+        super().__init__(" ".join(f"{where}: {key} = {shown}: {remedy}".split()))
+
+
+class RunError(RuntimeError):
+    """A failure while running that is not the user's mistake (disk full, every trajectory failed): exit code 1."""

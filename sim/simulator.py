@@ -1,0 +1,112 @@
+"""The contract that every simulator obeys, solver or learned model, and the one frame loop that drives them all.
+
+A simulator begins from a ``Start`` and advances by whole frames. Metrics, timing, pictures and stability studies are
+written once against this contract; a coarser solver, a GNS and "constant velocity" are entries in one list of contenders.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+import numpy as np
+
+from sim.trajectory import Trajectory
+
+Kind = Literal["reference", "solver", "learned", "trivial", "oracle", "floor"]
+
+
+@dataclass(frozen=True)
+class Start:
+    """What a simulator may know before it predicts.
+
+    history [h, particles, dim] float32: the last h known frames, the present last; particle_type [particles] int8;
+    present: frame index of ``history[-1]``; frame_step [s]; radius; bounds [dim, 2]; scene: the resolved scene (what a
+    solver starts from; a learned model may read its gravity and bounds, never its future); context [frames, c] or None:
+    prescribed for all frames; kinematic [frames, k, dim] or None: prescribed positions of the kinematic particles.
+    """
+
+    history: np.ndarray
+    particle_type: np.ndarray
+    present: int
+    frame_step: float
+    radius: float
+    bounds: np.ndarray
+    scene: dict
+    context: np.ndarray | None = None
+    kinematic: np.ndarray | None = None
+
+    @property
+    def gravity(self) -> np.ndarray:
+        """[dim], length / s^2."""
+        return np.asarray(self.scene["gravity"], float)
+
+
+def start_from(trajectory: Trajectory, history: int = 6) -> Start:
+    """The start that hands a simulator the first ``history`` frames of a trajectory."""
+    kinematic = ~trajectory.moving
+    return Start(
+        history=trajectory.position[:history], particle_type=trajectory.particle_type, present=history - 1,
+        frame_step=trajectory.frame_step, radius=trajectory.radius, bounds=trajectory.bounds, scene=trajectory.scene,
+        context=trajectory.context, kinematic=trajectory.position[:, kinematic] if kinematic.any() else None,
+    )
+
+
+class Simulator(Protocol):
+    """Anything that turns a start into frames."""
+
+    name: str
+    kind: Kind
+    settings: dict
+
+    def begin(self, start: Start) -> None:
+        """Compile, allocate and load the state of ``start.history[-1]``. Never timed as run time."""
+
+    def advance(self) -> np.ndarray:
+        """The next k >= 1 frames, [k, particles, dim] float32 (a model that predicts m frames at once returns m)."""
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """position [frames, particles, dim] float32, NaN after a failure; seconds: run time without ``begin``; status as in ``Trajectory``."""
+
+    position: np.ndarray
+    seconds: float
+    begin_seconds: float
+    status: str
+
+
+class SimulationError(RuntimeError):
+    """A simulator cannot go on (time step at its floor, particle outside the grid); the message is the trajectory's status."""
+
+
+def rollout(simulator: Simulator, start: Start, frames: int) -> Rollout:
+    """Drive a simulator for ``frames`` frames after ``start.history[-1]``; a non-finite frame ends it with a status.
+
+    Simulators return host arrays, so a device is synchronised by the time a frame arrives here.
+    """
+    clock = time.perf_counter
+    begun = clock()
+    simulator.begin(start)
+    begin_seconds = clock() - begun
+    position = np.full((frames, *start.history.shape[1:]), np.nan, np.float32)
+    done, status, seconds = 0, "ok", 0.0
+    while done < frames:
+        begun = clock()
+        try:
+            block = simulator.advance()
+        except SimulationError as error:
+            status = f"failed: {error} (frame {start.present + 1 + done})"
+            break
+        finally:
+            seconds += clock() - begun
+        finite = np.isfinite(block).all(axis=(1, 2))
+        usable = len(block) if finite.all() else int(np.argmin(finite))
+        count = min(usable, frames - done)
+        position[done : done + count] = block[:count]
+        done += count
+        if usable < len(block) and done < frames:
+            status = f"failed: non-finite position (frame {start.present + 1 + done})"
+            break
+    return Rollout(position=position, seconds=seconds, begin_seconds=begin_seconds, status=status)
