@@ -1,0 +1,73 @@
+"""A tiny data set (ballistic particles that bounce off the walls of the unit box) and a dummy model that only the trainer's tests use."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from sim.trajectory import Trajectory, write_shard
+
+torch.set_num_threads(1)
+
+GRAVITY = (0.0, -9.81)
+FRAME_STEP = 0.01
+
+
+def bounce(seed: int, particles: int = 24, frames: int = 40) -> Trajectory:
+    """Independent particles under gravity in the box [0.1, 0.9]^2, reflected by its walls with restitution 0.6."""
+    generator = np.random.default_rng(seed)
+    lower, upper = 0.1, 0.9
+    position = generator.uniform(0.3, 0.8, (particles, 2))
+    velocity = generator.normal(0, 0.5, (particles, 2))
+    path = []
+    for _ in range(frames):
+        path.append(position.astype(np.float32))
+        velocity = velocity + FRAME_STEP * np.asarray(GRAVITY)
+        position = position + FRAME_STEP * velocity
+        low, high = position < lower, position > upper
+        position = np.where(low, 2 * lower - position, np.where(high, 2 * upper - position, position))
+        velocity = np.where(low | high, -0.6 * velocity, velocity)
+    scene = {
+        "name": "bounce", "dim": 2, "bounds": [[lower, upper]] * 2, "gravity": list(GRAVITY), "frame_step": FRAME_STEP, "frames": frames,
+        "radius": 0.1, "spacing": 0.05, "grid_spacing": 0.1, "refine": 1, "materials": {}, "bodies": [],
+    }
+    return Trajectory(
+        position=np.stack(path), particle_type=np.full(particles, 5, np.int8), frame_step=FRAME_STEP, radius=0.1,
+        bounds=np.array([[lower, upper]] * 2), scene=scene, seed=seed, simulator={"name": "bounce"},
+    )
+
+
+def write_dataset(folder: Path, splits: dict[str, dict[int, Trajectory]], per_shard: int = 2) -> Path:
+    """Write trajectories as a data set folder, ``per_shard`` in a shard, with the statistics of the training split."""
+    content = {"format_version": 1, "scene": "bounce", "family": {}, "splits": {}}
+    for split, trajectories in splits.items():
+        names, indices = [], sorted(trajectories)
+        for number, begin in enumerate(range(0, len(indices), per_shard)):
+            names.append(f"{split}/shard-{number:05d}.h5")
+            write_shard(folder / names[-1], {index: trajectories[index] for index in indices[begin : begin + per_shard]})
+        content["splits"][split] = {"trajectories": len(indices), "ok": len(indices), "failed": [], "shards": names}
+    moving = [trajectory.position[:, trajectory.moving].astype(float) for trajectory in splits["train"].values()]
+    velocity = np.concatenate([(p[1:] - p[:-1]).reshape(-1, p.shape[2]) for p in moving])
+    acceleration = np.concatenate([(p[2:] - 2 * p[1:-1] + p[:-2]).reshape(-1, p.shape[2]) for p in moving])
+    content["statistics"] = {
+        "velocity_mean": velocity.mean(0).tolist(), "velocity_std": velocity.std(0).tolist(),
+        "acceleration_mean": acceleration.mean(0).tolist(), "acceleration_std": acceleration.std(0).tolist(),
+        "particles": [24, 24.0, 24], "frames": moving[0].shape[0], "neighbours": 5.0,
+    }
+    (folder / "dataset.json").write_text(json.dumps(content))
+    return folder
+
+
+@pytest.fixture(scope="session")
+def bounce_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A data set of 5 training, 2 validation and 3 test trajectories; not to be changed by a test."""
+    splits = {
+        "train": {index: bounce(index) for index in range(5)},
+        "valid": {index: bounce(100 + index) for index in range(2)},
+        "test": {index: bounce(200 + index) for index in range(3)},
+    }
+    return write_dataset(tmp_path_factory.mktemp("bounce"), splits)
