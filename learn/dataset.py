@@ -351,7 +351,7 @@ class Dataset:
         found = np.concatenate(rows)
         if len(found) == 0:
             longest = max(shape[0] for shape in self.shapes)
-            remedy = f"no window of that many file frames (the longest trajectory of the {self.split} split has {longest}): lower stride, history or skip_rest"
+            remedy = f"the longest trajectory of the {self.split} split has {longest} frames and no such window: lower stride, history or skip_rest"
             raise InputError(self.path, "window", span + 1, remedy)
         return found
 

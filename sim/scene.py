@@ -1,0 +1,460 @@
+"""Scenes: what a trajectory is made of. A *family* (a YAML file with sampling ranges) and a seed give one resolved scene.
+
+Units are SI on a box of about one metre unless a file says otherwise. Random numbers come from NumPy's ``Generator``, never
+from a solver. Decision: the grid is given in cells along the box and the particle spacing in particles per cell, so that a
+wall always lies on a grid node and mass is exact; lengths that would have to agree with each other cannot disagree.
+"""
+
+from __future__ import annotations
+
+import copy
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from scipy.spatial import ConvexHull, cKDTree
+
+from sim.errors import InputError
+from sim.trajectory import PARTICLE_TYPES
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+#: A fixed number or a [low, high] range that is sampled uniformly.
+Range = Finite | tuple[Finite, Finite]
+
+_TRIES = 2000
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Water(_Strict):
+    """Weakly compressible water, Tait pressure p = (rho0 c^2 / gamma) (J^-gamma - 1) (Batchelor 1967; Monaghan 1994, eq. 3)."""
+
+    model: Literal["water"]
+    density: Positive = 1000.0
+    sound_speed: Positive
+    gamma: Annotated[float, Field(ge=1, le=10)] = 7.0
+
+
+class Sand(_Strict):
+    """Cohesionless Drucker-Prager sand on Hencky strain (Klar et al. 2016). young_modulus [Pa], friction_angle [degrees]."""
+
+    model: Literal["sand"]
+    density: Positive = 1800.0
+    young_modulus: Positive
+    poisson_ratio: Annotated[float, Field(ge=0, lt=0.5)] = 0.3
+    friction_angle: Annotated[float, Field(ge=0, lt=90)]
+
+
+Material = Annotated[Water | Sand, Field(discriminator="model")]
+
+
+class BoxShape(_Strict):
+    """A box with edges ``size`` (one range per axis), rounded to whole particle spacings."""
+
+    kind: Literal["box"]
+    size: list[Range]
+
+
+class BallShape(_Strict):
+    """A disc (2D) or ball (3D)."""
+
+    kind: Literal["ball"]
+    radius: Range
+
+
+class PolygonShape(_Strict):
+    """A random convex polygon (2D): the hull of ``corners`` points at random angles on a circle of radius ``radius``."""
+
+    kind: Literal["polygon"]
+    radius: Range
+    corners: tuple[Annotated[int, Field(ge=3)], Annotated[int, Field(ge=3, le=64)]] = (4, 8)
+
+
+class BodyFamily(_Strict):
+    """``count`` bodies of one material. ``center`` defaults to anywhere in the box where the body fits."""
+
+    material: str
+    shape: Annotated[BoxShape | BallShape | PolygonShape, Field(discriminator="kind")]
+    count: tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0, le=64)]] = (1, 1)
+    center: list[Range] | None = None
+    velocity: list[Range] | None = None
+
+
+class Walls(_Strict):
+    """Separating walls with Coulomb friction: 0 is free slip, ``sticky`` holds everything that touches."""
+
+    friction: Annotated[float, Field(ge=0, allow_inf_nan=False)] | Literal["sticky"] = 0.0
+
+
+class Splits(_Strict):
+    train: Annotated[int, Field(ge=0)]
+    valid: Annotated[int, Field(ge=0)]
+    test: Annotated[int, Field(ge=0)]
+
+
+def _sample(value: Range, rng: np.random.Generator) -> float:
+    return float(rng.uniform(*value)) if isinstance(value, tuple) else float(value)
+
+
+class _Physics(_Strict):
+    """What a family and a resolved scene share."""
+
+    name: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]*$")]
+    dim: Literal[2, 3]
+    bounds: list[tuple[Finite, Finite]]
+    gravity: list[Finite]
+    frame_step: Positive
+    frames: Annotated[int, Field(ge=2)]
+    radius: Positive
+    cells: list[Annotated[int, Field(ge=4, le=4096)]]
+    particles_per_cell: Annotated[int, Field(ge=1, le=4)] = 2
+    refine: Annotated[int, Field(ge=1, le=8)] = 1
+    jitter: Annotated[float, Field(ge=0, le=0.5)] = 0.0
+    cfl: Annotated[float, Field(gt=0, le=4)] = 0.4
+    walls: Walls = Walls()
+    materials: dict[str, Material]
+
+    @property
+    def grid_spacing(self) -> float:
+        """Edge of a grid cell of the *recorded* resolution; the teacher's is this over ``refine``."""
+        return (self.bounds[0][1] - self.bounds[0][0]) / self.cells[0]
+
+    @property
+    def spacing(self) -> float:
+        """Spacing of the recorded particles; the teacher's is this over ``refine``."""
+        return self.grid_spacing / self.particles_per_cell
+
+    @model_validator(mode="after")
+    def _consistent(self) -> _Physics:
+        for key in ("bounds", "gravity", "cells"):
+            if len(getattr(self, key)) != self.dim:
+                raise _mistake(key, getattr(self, key), f"needs {self.dim} entries, one per axis")
+        for axis, (lower, upper) in enumerate(self.bounds):
+            if not lower < upper:
+                raise _mistake(f"bounds[{axis}]", [lower, upper], "lower must be below upper")
+        edges = [(upper - lower) / cells for (lower, upper), cells in zip(self.bounds, self.cells, strict=True)]
+        if max(edges) > min(edges) * (1 + 1e-6):
+            remedy = [max(4, round((upper - lower) / edges[0])) for lower, upper in self.bounds]
+            raise _mistake("cells", self.cells, f"cells must be square (edges {[round(edge, 6) for edge in edges]}); try {remedy}")
+        if self.radius < self.spacing:
+            raise _mistake("radius", self.radius, f"below the particle spacing {self.spacing:.6g}: no particle would have a neighbour; use at least {1.5 * self.spacing:.4g}")
+        if not self.materials:
+            raise _mistake("materials", {}, "name at least one material")
+        for name, material in self.materials.items():
+            if self.dim == 3 and isinstance(material, Sand) and material.friction_angle > 36.9:
+                raise _mistake(f"materials.{name}.friction_angle", material.friction_angle, "a compression-matched Drucker-Prager cone cannot yield in triaxial extension above 36.9 degrees in 3D; use less")
+        return self
+
+
+def _mistake(key: str, value: object, remedy: str) -> ValueError:
+    """A validator's error that carries key, value and remedy to ``explain_validation``."""
+    return ValueError(json.dumps({"key": key, "value": value, "remedy": remedy}))
+
+
+class _FamilyModel(_Physics):
+    bodies: list[BodyFamily]
+    splits: Splits
+    variants: dict[str, dict[str, Any]] = {}
+
+    @model_validator(mode="after")
+    def _bodies_fit(self) -> _FamilyModel:
+        if not self.bodies or all(body.count[1] == 0 for body in self.bodies):
+            raise _mistake("bodies", [], "an empty scene: add at least one body")
+        for index, body in enumerate(self.bodies):
+            where = f"bodies[{index}]"
+            if body.material not in self.materials:
+                raise _mistake(f"{where}.material", body.material, f"not among materials {sorted(self.materials)}")
+            if body.count[0] > body.count[1]:
+                raise _mistake(f"{where}.count", list(body.count), "low must not exceed high")
+            if isinstance(body.shape, PolygonShape) and self.dim != 2:
+                raise _mistake(f"{where}.shape.kind", "polygon", "polygons are 2D; use box or ball")
+            lists = {"center": body.center, "velocity": body.velocity, "shape.size": getattr(body.shape, "size", None)}
+            scalars = {"shape.radius": getattr(body.shape, "radius", None), "shape.corners": getattr(body.shape, "corners", None)}
+            for key, values in lists.items():
+                if values is not None and len(values) != self.dim:
+                    raise _mistake(f"{where}.{key}", values, f"needs {self.dim} entries, one per axis")
+            for key, value in [*scalars.items(), *((f"{key}[{axis}]", value) for key, values in lists.items() for axis, value in enumerate(values or []))]:
+                low, high = value if isinstance(value, tuple) else (value, value)
+                if value is not None and low > high:
+                    raise _mistake(f"{where}.{key}", value, "low must not exceed high")
+                if value is not None and key.startswith("shape") and low < self.spacing:
+                    if key != "shape.corners":
+                        raise _mistake(f"{where}.{key}", value, f"must be at least one particle spacing ({self.spacing:.6g})")
+        return self
+
+
+@dataclass(frozen=True)
+class Particles:
+    """position, velocity [n, dim] float64; material [n] (index into the scene's materials); tracked: indices of the recorded ones."""
+
+    position: np.ndarray
+    velocity: np.ndarray
+    material: np.ndarray
+    tracked: np.ndarray
+    spacing: float
+
+
+class Body(_Strict):
+    """A resolved body: ``kind`` box (lower, upper), ball (center, radius) or polygon (vertices)."""
+
+    material: str
+    kind: Literal["box", "ball", "polygon"]
+    velocity: list[Finite]
+    lower: list[Finite] | None = None
+    upper: list[Finite] | None = None
+    center: list[Finite] | None = None
+    radius: Positive | None = None
+    vertices: list[list[Finite]] | None = None
+
+    def extent(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper corner of the bounding box."""
+        if self.kind == "box":
+            return np.array(self.lower), np.array(self.upper)
+        if self.kind == "ball":
+            return np.array(self.center) - self.radius, np.array(self.center) + self.radius
+        return np.min(self.vertices, axis=0), np.max(self.vertices, axis=0)
+
+    def inside(self, points: np.ndarray) -> np.ndarray:
+        """[n] bool: which points [n, dim] lie in the body."""
+        if self.kind == "box":
+            return np.ones(len(points), bool)
+        if self.kind == "ball":
+            return ((points - self.center) ** 2).sum(1) <= self.radius**2
+        equations = ConvexHull(self.vertices).equations
+        return (points @ equations[:, :-1].T + equations[:, -1] <= 0).all(1)
+
+
+class Scene(_Physics):
+    """A fully resolved scene: nothing left to sample but the lattice jitter, which ``seed`` determines."""
+
+    seed: Annotated[int, Field(ge=0)]
+    bodies: list[Body]
+
+    def to_dict(self) -> dict:
+        """Plain JSON, with the derived lengths beside the inputs for readers that are not this code."""
+        return self.model_dump(mode="json") | {"spacing": self.spacing, "grid_spacing": self.grid_spacing}
+
+    @classmethod
+    def from_dict(cls, content: dict, where: object = "scene") -> Scene:
+        """Inverse of ``to_dict``; raises ``InputError``."""
+        content = {key: value for key, value in content.items() if key not in ("spacing", "grid_spacing")}
+        try:
+            return cls.model_validate(content)
+        except ValidationError as error:
+            raise explain_validation(error, where) from None
+
+    def particles(self, refine: int | None = None) -> Particles:
+        """Lattice particles of all bodies, ``refine`` times finer per axis than the recorded ones (default: the teacher's).
+
+        Packing: one recorded particle per cube of edge ``spacing``, mass density * spacing^dim. A body is the union of the
+        lattice cubes whose centres lie in it, so its mass is the same at every refinement. The recorded particle of a cube
+        is the central one of its refine^dim particles, or one of the 2^dim central ones drawn at random (unbiased) when
+        ``refine`` is even. ``refine=1`` gives the recorded particles of the *same* layout: the same set in every rung.
+        """
+        coarse = refine == 1
+        k, dim, spacing = self.refine, self.dim, self.spacing
+        rng = np.random.default_rng(np.random.SeedSequence([self.seed, 1]))
+        offsets = (np.stack(np.meshgrid(*[np.arange(k)] * dim, indexing="ij"), -1).reshape(-1, dim) + 0.5) / k - 0.5
+        reach = np.abs(offsets).max(1)
+        central = np.flatnonzero(reach <= reach.min() + 1e-9)
+        parts = []
+        names = list(self.materials)
+        for body in self.bodies:
+            lower, upper = body.extent()
+            counts = np.maximum(np.rint((upper - lower) / spacing).astype(int), 1)
+            start = (lower + upper) / 2 - counts * spacing / 2
+            cubes = start + (np.stack(np.meshgrid(*[np.arange(c) for c in counts], indexing="ij"), -1).reshape(-1, dim) + 0.5) * spacing
+            cubes = cubes[body.inside(cubes)]
+            position = cubes[:, None] + offsets * spacing
+            position = position + rng.uniform(-0.5, 0.5, position.shape) * self.jitter * spacing / k
+            choice = central[rng.integers(len(central), size=len(cubes))]
+            tracked = np.zeros(position.shape[:2], bool)
+            tracked[np.arange(len(cubes)), choice] = True
+            parts.append((position.reshape(-1, dim), tracked.ravel(), names.index(body.material), body.velocity))
+        # Solvers loop over one contiguous range per material.
+        parts.sort(key=lambda part: part[2])
+        position = np.concatenate([part[0] for part in parts])
+        tracked = np.concatenate([part[1] for part in parts])
+        material = np.concatenate([np.full(len(part[0]), part[2]) for part in parts])
+        velocity = np.concatenate([np.tile(np.asarray(part[3], float), (len(part[0]), 1)) for part in parts])
+        if coarse:
+            position, velocity, material = position[tracked], velocity[tracked], material[tracked]
+            tracked = np.ones(len(position), bool)
+        return Particles(position, velocity, material, np.flatnonzero(tracked), spacing if coarse else spacing / k)
+
+    def particle_type(self) -> np.ndarray:
+        """[recorded particles] int8, ids of ``PARTICLE_TYPES``."""
+        kinds = np.array([PARTICLE_TYPES[material.model] for material in self.materials.values()], np.int8)
+        return kinds[self.particles(refine=1).material]
+
+
+class SceneFamily:
+    """A validated scene file; ``sample(seed)`` draws a ``Scene``."""
+
+    def __init__(self, content: dict, where: object, variant: str | None = None):
+        self.where = where
+        if not isinstance(content, dict):
+            raise InputError(where, "file", content, "must be a mapping of keys to values")
+        variants = content.get("variants") or {}
+        if variant is not None:
+            if not isinstance(variants, dict) or not isinstance(variants.get(variant), dict):
+                raise InputError(where, "variant", variant, f"not among the variants {sorted(variants)}")
+            content = _merged(content, variants[variant])
+            content["name"] = f"{content.get('name')}-{variant}"
+        try:
+            self.model = _FamilyModel.model_validate(content)
+        except ValidationError as error:
+            raise explain_validation(error, where) from None
+
+    @classmethod
+    def load(cls, path: str | Path, variant: str | None = None) -> SceneFamily:
+        """Read a family from YAML; every mistake is an ``InputError`` naming file, key, value and remedy."""
+        return cls(read_yaml(path), path, variant)
+
+    def to_dict(self) -> dict:
+        return self.model.model_dump(mode="json")
+
+    def sample(self, seed: int) -> Scene:
+        """Draw one scene. Bodies are placed by rejection until they lie inside the box and apart from each other."""
+        model = self.model
+        rng = np.random.default_rng(np.random.SeedSequence([seed, 0]))
+        shared = {name: getattr(model, name) for name in _Physics.model_fields}
+        chosen = [index for index, body in enumerate(model.bodies) for _ in range(int(rng.integers(body.count[0], body.count[1] + 1)))]
+        if not chosen:
+            chosen = [0]
+        reason = ("bodies", "outside the box")
+        for _ in range(_TRIES):
+            bodies: list[Body] = []
+            for index in chosen:
+                body = self._place(model.bodies[index], rng)
+                fault = self._fault(body, bodies)
+                if fault:
+                    reason = (f"bodies[{index}]", fault)
+                    break
+                bodies.append(body)
+            else:
+                return Scene(seed=seed, bodies=bodies, **shared)
+        raise InputError(self.where, reason[0], f"seed {seed}", f"{reason[1]} in each of {_TRIES} draws; make it smaller, move its center or allow fewer bodies")
+
+    def _place(self, family: BodyFamily, rng: np.random.Generator) -> Body:
+        model, shape, spacing = self.model, family.shape, self.model.spacing
+        lower, upper = np.array(model.bounds).T
+        outline: np.ndarray | None = None
+        if shape.kind == "box":
+            half = np.array([max(1, round(_sample(edge, rng) / spacing)) * spacing for edge in shape.size]) / 2
+        else:
+            radius = _sample(shape.radius, rng)
+            half = np.full(model.dim, radius)
+            if shape.kind == "polygon":
+                angles = np.sort(rng.uniform(0, 2 * np.pi, int(rng.integers(shape.corners[0], shape.corners[1] + 1))))
+                outline = radius * np.stack([np.cos(angles), np.sin(angles)], -1)
+        if family.center is None:
+            room = np.maximum(upper - lower - 2 * half, 0)
+            center = lower + half + rng.uniform(size=model.dim) * room
+        else:
+            center = np.array([_sample(value, rng) for value in family.center])
+        velocity = [_sample(value, rng) for value in family.velocity] if family.velocity else [0.0] * model.dim
+        common = {"material": family.material, "kind": shape.kind, "velocity": velocity}
+        if shape.kind == "box":
+            return Body(lower=(center - half).tolist(), upper=(center + half).tolist(), **common)
+        if shape.kind == "ball":
+            return Body(center=center.tolist(), radius=radius, **common)
+        return Body(vertices=(center + outline).tolist(), **common)
+
+    def _fault(self, body: Body, others: list[Body]) -> str | None:
+        model = self.model
+        lower, upper = np.array(model.bounds).T
+        low, high = body.extent()
+        if (low < lower - 1e-9).any() or (high > upper + 1e-9).any():
+            return "outside the box"
+        if not len(_cube_centers(body, model.spacing)):
+            return "too thin to hold a particle"
+        for other in others:
+            other_low, other_high = other.extent()
+            if (low < other_high + model.spacing).all() and (other_low < high + model.spacing).all():
+                distance = cKDTree(_cube_centers(other, model.spacing)).query(_cube_centers(body, model.spacing))[0]
+                if distance.min() < 1.5 * model.spacing:
+                    return "overlapping another body"
+        return None
+
+
+def _cube_centers(body: Body, spacing: float) -> np.ndarray:
+    lower, upper = body.extent()
+    counts = np.maximum(np.rint((upper - lower) / spacing).astype(int), 1)
+    start = (lower + upper) / 2 - counts * spacing / 2
+    cubes = start + (np.stack(np.meshgrid(*[np.arange(c) for c in counts], indexing="ij"), -1).reshape(-1, len(counts)) + 0.5) * spacing
+    return cubes[body.inside(cubes)]
+
+
+def _merged(base: dict, change: dict) -> dict:
+    result = copy.deepcopy(base)
+    for key, value in change.items():
+        result[key] = _merged(result[key], value) if isinstance(value, dict) and isinstance(result.get(key), dict) else value
+    return result
+
+
+class _UniqueKeyLoader(yaml.SafeLoader):
+    """Refuses duplicate keys, which plain YAML loaders silently let win."""
+
+
+def _unique_mapping(loader: yaml.SafeLoader, node: yaml.MappingNode, deep: bool = False) -> dict:
+    mapping: dict = {}
+    for key_node, value_node in node.value:
+        key = loader.construct_object(key_node, deep=deep)
+        if not isinstance(key, str):
+            raise yaml.constructor.ConstructorError(None, None, f"key {key!r} is not text", key_node.start_mark)
+        if key in mapping:
+            raise yaml.constructor.ConstructorError(None, None, f"duplicate key {key!r}", key_node.start_mark)
+        mapping[key] = loader.construct_object(value_node, deep=deep)
+    return mapping
+
+
+_UniqueKeyLoader.add_constructor(yaml.resolver.BaseResolver.DEFAULT_MAPPING_TAG, _unique_mapping)
+
+
+def read_yaml(path: str | Path) -> Any:
+    """Read a YAML file with the safe loader, duplicate keys refused; raises ``InputError``."""
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(path, "file", getattr(error, "strerror", None) or "not text", "give a readable YAML file") from None
+    try:
+        return yaml.load(text, _UniqueKeyLoader)  # noqa: S506 (a SafeLoader)
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        mark = getattr(error, "problem_mark", None)
+        raise InputError(path, f"line {mark.line + 1}" if mark else "file", getattr(error, "problem", None) or str(error), "not valid YAML; correct the line") from None
+
+
+def explain_validation(error: ValidationError, where: object) -> InputError:
+    """The first fault of a pydantic error as an ``InputError``."""
+    first = error.errors(include_url=False)[0]
+    path, value, location = "", first["input"], first["loc"]
+    for place, part in enumerate(location):
+        # pydantic names the branch of a union after the key; that is not a key of the file.
+        branch = place > 0 and (location[place - 1] == "shape" or (place == 2 and location[0] == "materials") or str(part) in ("float", "str", "constrained-str", "literal['sticky']") or "[" in str(part))
+        if isinstance(part, int):
+            path += f"[{part}]"
+        elif not branch:
+            path += f".{part}" if path else part
+    message = first["msg"].removeprefix("Value error, ")
+    if first["type"] == "value_error":
+        try:
+            detail = json.loads(message)
+            return InputError(where, ".".join(filter(None, [path, detail["key"]])), detail["value"], detail["remedy"])
+        except (ValueError, KeyError, TypeError):
+            pass
+    if first["type"] == "extra_forbidden":
+        message = "unknown key; remove it or correct its spelling"
+    elif first["type"] == "missing":
+        message = "missing; add it"
+        value = None
+    else:
+        message = message[0].lower() + message[1:] + "; correct the value"
+    return InputError(where, path or "file", value, message)
