@@ -438,7 +438,7 @@ def explain_validation(error: ValidationError, where: object) -> InputError:
     path, value, location = "", first["input"], first["loc"]
     for place, part in enumerate(location):
         # pydantic names the branch of a union after the key; that is not a key of the file.
-        branch = place > 0 and (location[place - 1] == "shape" or (place == 2 and location[0] == "materials") or str(part) in ("float", "str", "constrained-str", "literal['sticky']") or "[" in str(part))
+        branch = place > 0 and (location[place - 1] == "shape" or (place == 2 and location[0] == "materials") or str(part) in ("float", "str", "constrained-float") or "[" in str(part))
         if isinstance(part, int):
             path += f"[{part}]"
         elif not branch:

@@ -1,0 +1,132 @@
+"""What a particle network sees: normalised node and edge features, the random-walk noise, the normalised acceleration.
+
+After Sanchez-Gonzalez et al. (ICML 2020). Velocities and accelerations are finite differences with dt = 1, in length / model frame
+and length / model frame^2. Nothing the data do not need is built: one particle type has no type embedding, data without context
+no context columns.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Literal
+
+import torch
+from torch import Tensor, nn
+
+from learn.graph import Graph
+from sim.trajectory import KINEMATIC_TYPE
+
+if TYPE_CHECKING:
+    from learn.dataset import DataSpec
+
+#: Slots and width of the particle-type embedding of the original.
+TYPE_SLOTS, TYPE_WIDTH = 9, 16
+
+#: Below this a standard deviation is taken for zero (an axis without motion, a constant context).
+SMALLEST_STD = 1e-8
+
+InputScaling = Literal["velocity", "acceleration", "last"]
+
+
+def random_walk_noise(position: Tensor, sigma: float, generator: torch.Generator, moving: Tensor | None = None) -> Tensor:
+    """Noise for a window of positions whose velocities have done a random walk; [frames, particles, dim], zero in the first frame.
+
+    Each of the C = frames - 1 velocities adds N(0, sigma^2 / C) per axis, summed along the window, so that the last velocity's noise
+    has standard deviation ``sigma`` [length / frame]; summed once more into positions. Particles outside ``moving`` [particles] get none.
+    Drawn on the CPU, so that a seed means the same noise on every device.
+    """
+    frames, particles, dim = position.shape
+    steps = torch.randn((frames - 1, particles, dim), generator=generator, dtype=torch.float32) * (sigma / math.sqrt(frames - 1))
+    steps = steps.to(position)
+    noise = torch.cat([torch.zeros_like(position[:1]), steps.cumsum(0).cumsum(0)])
+    return noise if moving is None else noise * moving[:, None]
+
+
+class Features(nn.Module):
+    """Node and edge features and the scale of the acceleration, for one data set.
+
+    spec: the data; sigma: noise of the last velocity [length / frame], which inflates every standard deviation to
+    sqrt(std^2 + sigma^2); velocities: C, how many past velocities are seen; radius: of the connectivity [length]; wall_distance: where
+    the distances to the walls are clamped [length]; scaling: "velocity", C velocities by velocity std (the paper); "acceleration", the
+    last velocity by velocity std and the C - 1 past accelerations by acceleration std; "last", the last velocity alone;
+    relative_velocity: v_sender - v_receiver on the edges; ballistic: predictions start from gravity * dt^2, not from the mean acceleration.
+    """
+
+    def __init__(self, spec: DataSpec, *, sigma: float, velocities: int, radius: float, wall_distance: float, scaling: InputScaling,
+                 relative_velocity: bool, ballistic: bool):
+        super().__init__()
+        self.velocities, self.radius, self.wall_distance = velocities, radius, wall_distance
+        self.scaling, self.relative_velocity = scaling, relative_velocity
+        step = spec.frame_step * spec.stride
+        base = [g * step * step for g in spec.gravity] if ballistic else spec.acceleration_mean
+
+        def constant(name: str, values) -> None:
+            # Not in the state dict: they follow from the spec, which travels in the checkpoint.
+            self.register_buffer(name, torch.tensor(values, dtype=torch.float32), persistent=False)
+
+        def inflated(std) -> list[float]:
+            return [max(math.hypot(s, sigma), SMALLEST_STD) for s in std]
+
+        constant("velocity_mean", spec.velocity_mean)
+        constant("velocity_std", inflated(spec.velocity_std))
+        constant("acceleration_mean", spec.acceleration_mean)
+        constant("acceleration_std", inflated(spec.acceleration_std))
+        constant("acceleration_base", base)
+        constant("bounds", spec.bounds)
+        self.embedding = nn.Embedding(TYPE_SLOTS, TYPE_WIDTH) if len(spec.particle_types) > 1 else None
+        self.kinematic = KINEMATIC_TYPE in spec.particle_types
+        self.context = spec.context_mean is not None
+        if self.context:
+            constant("context_mean", spec.context_mean)
+            constant("context_std", [max(s, SMALLEST_STD) for s in spec.context_std])
+        shown = 1 if scaling == "last" else velocities
+        self.node_width = (shown + 2) * spec.dim + (TYPE_WIDTH if self.embedding else 0) + (len(spec.context_mean) if self.context else 0)
+        self.edge_width = spec.dim + 1 + (spec.dim if relative_velocity else 0)
+
+    def moving(self, particle_type: Tensor) -> Tensor | None:
+        """[particles] bool, or None where the data have no kinematic particle."""
+        return particle_type != KINEMATIC_TYPE if self.kinematic else None
+
+    def nodes(self, position: Tensor, particle_type: Tensor, bounds: Tensor, context: Tensor | None = None) -> Tensor:
+        """[particles, node_width]: motion (oldest first), clip(distance to lower and upper walls / wall_distance, -1, 1), type embedding, context.
+
+        position [C + 1, particles, dim], length; particle_type [particles] int64; bounds [dim, 2], length; context [particles, c].
+        """
+        velocity = position.diff(dim=0)
+        scaled = (velocity - self.velocity_mean) / self.velocity_std
+        if self.scaling == "velocity":
+            motion = [*scaled]
+        elif self.scaling == "acceleration":
+            motion = [*((velocity.diff(dim=0) - self.acceleration_mean) / self.acceleration_std), scaled[-1]]
+        else:
+            motion = [scaled[-1]]
+        wall = torch.cat([position[-1] - bounds[:, 0], bounds[:, 1] - position[-1]], 1)
+        columns = [*motion, (wall / self.wall_distance).clamp(-1, 1)]
+        if self.embedding is not None:
+            columns.append(self.embedding(particle_type))
+        if self.context:
+            columns.append((context - self.context_mean) / self.context_std)
+        return torch.cat([column.to(self.velocity_std.dtype) for column in columns], 1)
+
+    def edges(self, position: Tensor, graph: Graph) -> Tensor:
+        """[edges, edge_width]: (x_sender - x_receiver) / radius, its norm, and optionally (v_sender - v_receiver) / velocity std.
+
+        position [C + 1, particles, dim], length.
+        """
+        def difference(values: Tensor) -> Tensor:
+            return values.index_select(0, graph.sender) - values.index_select(0, graph.receiver)
+
+        offset = difference(position[-1]) / self.radius
+        # Self edges have offset 0, where the norm has no gradient: vector_norm gives 0 there.
+        columns = [offset, torch.linalg.vector_norm(offset, dim=1, keepdim=True)]
+        if self.relative_velocity:
+            columns.append(difference((position[-1] - position[-2]) / self.velocity_std))
+        return torch.cat([column.to(self.velocity_std.dtype) for column in columns], 1)
+
+    def acceleration(self, output: Tensor) -> Tensor:
+        """Acceleration [length / frame^2] of a network's output [particles, dim]."""
+        return output * self.acceleration_std + self.acceleration_base
+
+    def target(self, position: Tensor, following: Tensor) -> Tensor:
+        """The output that takes position[-2:] to ``following``: ((p_next - 2 p_t + p_{t-1}) - base) / std; all [particles, dim] a frame."""
+        return (following - 2 * position[-1] + position[-2] - self.acceleration_base) / self.acceleration_std

@@ -1,0 +1,396 @@
+"""Grid emulator: particles -> grid -> small sparse U-Net -> the next m frames at once -> particles.
+
+After NeuralMPM (Rochman-Sharabi, Lewin, Louppe 2024, arXiv 2408.15753), with four changes: the network runs on *occupied* nodes
+only (a dense 40 x 40 U-Net spends nine tenths of its work on empty air, and a batch of scenes needs no padding), it answers for the
+*deviation from ballistic flight* (free flight is exact and need not be learnt), it is read once, at the particles' starting places
+(the flow map over m frames, so no second transfer per frame), and it may blend a particle's velocity towards the grid's (PIC/FLIP).
+
+One call, all lengths in box units and times in model frames (dt = 1):
+
+    w_ip   = prod_a (1 - |x_p - x_i|_a / H_a)_+                              bilinear weights, node i, particle p
+    vbar_i = sum_p w_ip v_p / (sum_p w_ip + eps)                             particles to grid
+    (u_i1 .. u_im, b_i) = U-Net(density_i, vbar_i, accelerations_i, walls_i)
+    v_pj   = v_p + j g + sum_i w_ip (s_j u_ij) + b_p (sum_i w_ip vbar_i - v_p),   b_p = sum_i w_ip b_i,  j = 1 .. m
+    x_pj   = x_p + v_p1 + ... + v_pj
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from pydantic import BaseModel, ConfigDict, Field
+from torch import Tensor, nn
+from torch.nn import functional
+
+from learn.dataset import DataSpec, Windows
+from sim.simulator import Start
+from sim.trajectory import KINEMATIC_TYPE
+
+
+class GridEmulatorSettings(BaseModel):
+    """Options of ``GridEmulator``."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    frames_per_call: int = Field(8, ge=1)  # m: model frames that one network call predicts
+    history: int = Field(3, ge=2)  # model frames of input: history - 1 velocities, the last one and their differences
+    cell: float = Field(2.0, gt=0)  # H in particle spacings (rounded so that whole cells fill the box)
+    margin: int = Field(2, ge=1)  # cells kept outside each wall; a particle beyond them flies ballistically, unseen
+    channels: list[int] = Field([32, 48, 64], min_length=1)  # width of each level of the U-Net, finest first; each halves the resolution
+    blocks: int = Field(1, ge=1)  # residual blocks of two convolutions at each level, on the way down and again on the way up
+    wall_reach: float = Field(4.0, gt=0)  # distance in cells at which the wall features saturate
+    noise: float = Field(0.02, ge=0)  # std of the last input velocity's noise in velocity stds (random walk over the history)
+    unroll: list[int] = Field([1, 2, 4], min_length=1)  # calls a training window spans; equal shares of the training
+    floor: float = Field(0.03, gt=0)  # least scale of a frame's loss, in particle spacings: below it the loss would be all noise
+
+
+def random_walk_noise(position: Tensor, std: Tensor, moving: Tensor, generator: torch.Generator) -> Tensor:
+    """Position noise [history, N, d] whose velocities random-walk to ``std`` [d] at the last step; frame 0 and fixed particles get none.
+
+    Sanchez-Gonzalez et al. (2020): each of the h - 1 velocities adds N(0, std^2 / (h - 1)), summed along the window, summed again.
+    """
+    steps = position.shape[0] - 1
+    kick = torch.randn((steps, *position.shape[1:]), generator=generator, dtype=position.dtype) * (std / steps**0.5)
+    walk = kick.cumsum(0).cumsum(0) * moving[:, None]
+    return torch.cat([torch.zeros_like(position[:1]), walk])
+
+
+class _StencilConv(torch.autograd.Function):
+    """y_i = b + sum_k W_k x_(i+k) over the occupied nodes: gather the stencil's rows, one matrix product.
+
+    The backward pass gathers too (the adjoint of a gather along a symmetric stencil is the gather along the reversed one), which is
+    five times faster than autograd's scatter and has one order of summation.
+    """
+
+    @staticmethod
+    def forward(ctx, x: Tensor, weight: Tensor, bias: Tensor, neighbours: Tensor) -> Tensor:
+        stencil = neighbours.shape[1]
+        columns = _gather(x, neighbours)
+        ctx.save_for_backward(columns, weight, neighbours)
+        ctx.stencil = stencil
+        return torch.addmm(bias, columns, weight.reshape(-1, weight.shape[2]))
+
+    @staticmethod
+    def backward(ctx, grad: Tensor) -> tuple[Tensor, Tensor, Tensor, None]:
+        columns, weight, neighbours = ctx.saved_tensors
+        grad = grad.contiguous()
+        back = weight.flip(0).transpose(1, 2).reshape(-1, weight.shape[1])
+        return _gather(grad, neighbours) @ back, (columns.t() @ grad).view_as(weight), grad.sum(0), None
+
+
+def _gather(x: Tensor, neighbours: Tensor) -> Tensor:
+    """Rows of the stencil, [A, K C]; the index A means "empty" and gives zeros."""
+    padded = torch.cat([x, x.new_zeros(1, x.shape[1])])
+    return padded.index_select(0, neighbours.reshape(-1)).view(neighbours.shape[0], -1)
+
+
+class StencilConv(nn.Module):
+    """3^d convolution over occupied nodes (submanifold: outputs where inputs are). weight [3^d, C_in, C_out]."""
+
+    def __init__(self, dim: int, inputs: int, outputs: int):
+        super().__init__()
+        self.weight = nn.Parameter(torch.randn(3**dim, inputs, outputs) * (2 / (3**dim * inputs)) ** 0.5)
+        self.bias = nn.Parameter(torch.zeros(outputs))
+
+    def forward(self, x: Tensor, neighbours: Tensor) -> Tensor:
+        """[A, C_in], [A, 3^d] -> [A, C_out]."""
+        return _StencilConv.apply(x, self.weight, self.bias, neighbours)
+
+
+class Residual(nn.Module):
+    """x + conv(relu(conv(relu(x))))."""
+
+    def __init__(self, dim: int, channels: int):
+        super().__init__()
+        self.first, self.second = StencilConv(dim, channels, channels), StencilConv(dim, channels, channels)
+        with torch.no_grad():
+            self.second.weight.mul_(0.5)
+
+    def forward(self, x: Tensor, neighbours: Tensor) -> Tensor:
+        return x + self.second(functional.relu(self.first(functional.relu(x), neighbours)), neighbours)
+
+
+@dataclass(frozen=True)
+class Level:
+    """Occupied nodes of one resolution, all examples of a batch together.
+
+    neighbours [A, 3^d]: rows of the stencil, A where empty; child [A]: row of the node in the next coarser level's 2^d-fold
+    unfolded rows, ``parent * 2^d + corner``; coarse: rows of the next coarser level. The coarsest level has no child.
+    """
+
+    neighbours: Tensor
+    child: Tensor | None
+    coarse: int
+
+
+class SparseGrid(nn.Module):
+    """Index tables of a fixed regular grid and its halvings; finds the occupied nodes of each level.
+
+    ``shape`` [d]: nodes of the finest level. Each level is stored with a ring of one empty node, so that no stencil wraps round.
+    """
+
+    def __init__(self, shape: list[int], levels: int):
+        super().__init__()
+        dim = len(shape)
+        self.dim, self.levels, self.sizes = dim, levels, []
+        self.shape = list(shape)
+        for level in range(levels):
+            padded = torch.tensor(shape) + 2
+            strides = torch.tensor([int(padded[a + 1 :].prod()) for a in range(dim)])
+            offsets = torch.tensor(list(itertools.product((-1, 0, 1), repeat=dim)))
+            self.register_buffer(f"offset{level}", offsets @ strides, persistent=False)
+            self.register_buffer(f"stride{level}", strides, persistent=False)
+            self.sizes.append(int(padded.prod()))
+            shape = [(extent + 1) // 2 for extent in shape]
+            # Parent and corner of every node; the ring has none and is never occupied.
+            coordinate = torch.stack(torch.meshgrid(*[torch.arange(-1, int(p) - 1) for p in padded], indexing="ij"), -1).reshape(-1, dim)
+            coarse = torch.tensor([int((torch.tensor(shape) + 2)[a + 1 :].prod()) for a in range(dim)])
+            corner = (coordinate % 2) @ torch.tensor([2 ** (dim - 1 - a) for a in range(dim)])
+            parent = (torch.div(coordinate, 2, rounding_mode="floor") + 1) @ coarse
+            self.register_buffer(f"parent{level}", parent, persistent=False)
+            self.register_buffer(f"corner{level}", corner, persistent=False)
+
+    def occupy(self, nodes: Tensor, examples: int) -> tuple[Tensor, Tensor, list[Level]]:
+        """Levels occupied by ``nodes``, flat finest ids of any shape with ``example * sizes[0]`` added.
+
+        Returns the occupied ids [A] ascending, their row by id [examples * sizes[0]], and the levels, finest first.
+        """
+        ids, levels = nodes.reshape(-1), []
+        finest = rows = None
+        for level, size in enumerate(self.sizes):
+            mask = torch.zeros(examples * size + 1, dtype=torch.bool, device=ids.device)
+            mask[ids] = True
+            active = mask.nonzero().squeeze(1)
+            lookup = torch.full((examples * size,), len(active), device=ids.device)
+            lookup[active] = torch.arange(len(active), device=ids.device)
+            if level:
+                previous = levels[-1]
+                levels[-1] = Level(previous.neighbours, lookup[ids] * 2**self.dim + corner, len(active))
+            else:
+                finest, rows = active, lookup
+            neighbours = lookup[active[:, None] + getattr(self, f"offset{level}")]
+            levels.append(Level(neighbours, None, 0))
+            if level + 1 < self.levels:
+                example, local = active // size, active % size
+                corner = getattr(self, f"corner{level}")[local]
+                ids = getattr(self, f"parent{level}")[local] + example * self.sizes[level + 1]
+        return finest, rows, levels
+
+
+class SparseUNet(nn.Module):
+    """U-Net over the occupied nodes: 2^d-strided convolutions down and up, residual blocks, added skips, linear output from zero."""
+
+    def __init__(self, dim: int, inputs: int, channels: list[int], outputs: int, blocks: int):
+        super().__init__()
+        self.corners = 2**dim
+        self.enter = StencilConv(dim, inputs, channels[0])
+        self.down = nn.ModuleList(nn.Linear(self.corners * a, b) for a, b in itertools.pairwise(channels))
+        self.up = nn.ModuleList(nn.Linear(b, self.corners * a) for a, b in itertools.pairwise(channels))
+        self.encode = nn.ModuleList(nn.ModuleList(Residual(dim, c) for _ in range(blocks)) for c in channels)
+        self.decode = nn.ModuleList(nn.ModuleList(Residual(dim, c) for _ in range(blocks)) for c in channels[:-1])
+        self.leave = nn.Linear(channels[0], outputs)
+        nn.init.zeros_(self.leave.weight)
+        nn.init.zeros_(self.leave.bias)
+
+    def forward(self, x: Tensor, levels: list[Level]) -> Tensor:
+        """[A, inputs] at the finest level -> [A, outputs]."""
+        x, skips = self.enter(x, levels[0].neighbours), []
+        for depth, level in enumerate(levels):
+            for block in self.encode[depth]:
+                x = block(x, level.neighbours)
+            if level.child is not None:
+                skips.append(x)
+                unfolded = x.new_zeros(level.coarse * self.corners, x.shape[1]).index_copy(0, level.child, functional.relu(x))
+                x = self.down[depth](unfolded.view(level.coarse, -1))
+        for depth in reversed(range(len(skips))):
+            level = levels[depth]
+            x = self.up[depth](functional.relu(x)).view(-1, skips[depth].shape[1]).index_select(0, level.child) + skips[depth]
+            for block in self.decode[depth]:
+                x = block(x, level.neighbours)
+        return self.leave(functional.relu(x))
+
+
+class GridEmulator(nn.Module):
+    """The grid emulator as a learned model and as a simulator; the equations are at the head of this file."""
+
+    Settings = GridEmulatorSettings
+    name = "grid_emulator"
+    kind = "learned"
+
+    def __init__(self, settings: GridEmulatorSettings, spec: DataSpec):
+        super().__init__()
+        self.options, self.spec = settings, spec
+        self.settings = settings.model_dump()
+        dim, m = spec.dim, settings.frames_per_call
+        self.history = (settings.history - 1) * spec.stride + 1
+        bounds = torch.tensor(spec.bounds, dtype=torch.float32)
+        extent = bounds[:, 1] - bounds[:, 0]
+        cells = torch.clamp((extent / (settings.cell * spec.spacing)).round(), min=1)
+        nodes = [int(c) + 1 + 2 * settings.margin for c in cells]
+        self.grid = SparseGrid(nodes, len(settings.channels))
+        step = spec.frame_step * spec.stride
+
+        def constant(name: str, value: object) -> None:
+            self.register_buffer(name, torch.as_tensor(value, dtype=torch.float32), persistent=False)
+
+        constant("bounds", bounds)
+        constant("cell", extent / cells)
+        constant("origin", bounds[:, 0] - settings.margin * extent / cells)
+        constant("gravity", torch.tensor(spec.gravity) * step * step)
+        # Isotropic scales: a mirrored or turned scene has the same features.
+        constant("velocity_scale", max(float(np.sqrt(np.mean(np.square(spec.velocity_std)))), 1e-12))
+        constant("acceleration_scale", max(float(np.sqrt(np.mean(np.square(spec.acceleration_std)))), 1e-12))
+        constant("velocity_std", spec.velocity_std)
+        # Deviations from flight grow like a random walk of accelerations.
+        constant("frame_scale", torch.arange(1, m + 1).float().sqrt() * self.acceleration_scale)
+        # One particle per cell of its own: density 1 in the bulk.
+        constant("particle_mass", float(spec.spacing**dim / (extent / cells).prod()))
+        self.register_buffer("corners", torch.tensor(list(itertools.product((0, 1), repeat=dim))), persistent=False)
+        self.register_buffer("axis", (torch.arange(m)[:, None] + 1).float(), persistent=False)
+        self.fixed = KINEMATIC_TYPE in spec.particle_types
+        self.context = 0 if spec.context_mean is None else len(spec.context_mean)
+        if self.context:
+            constant("context_mean", spec.context_mean)
+            constant("context_std", np.maximum(spec.context_std, 1e-8))
+        inputs = len(spec.particle_types) + dim * (settings.history - 1) + 2 * dim + self.context
+        self.network = SparseUNet(dim, inputs, settings.channels, m * dim + 1, settings.blocks)
+
+    # ---- one call -------------------------------------------------------------------------------------------------------------------
+
+    def weights(self, position: Tensor, example: Tensor) -> tuple[Tensor, Tensor]:
+        """Flat node ids [N, 2^d] (offset by the example) and bilinear weights [N, 2^d] of positions [N, d]; zero weight off the grid."""
+        place = (position - self.origin) / self.cell
+        last = torch.tensor(self.grid.shape, device=place.device) - 2
+        base = torch.minimum(place.detach().floor().long().clamp(min=0), last)
+        fraction = place - base
+        inside = ((fraction >= 0) & (fraction <= 1)).all(1)
+        node = (base[:, None] + self.corners + 1) @ self.grid.stride0 + (example * self.grid.sizes[0])[:, None]
+        weight = torch.where(self.corners.bool(), fraction[:, None], 1 - fraction[:, None]).prod(2)
+        return node, weight * inside[:, None]
+
+    def to_grid(self, value: Tensor, row: Tensor, weight: Tensor, rows: int) -> Tensor:
+        """Weighted sums [A, F] of particle values [N, F]: sum_p w_ip f_p."""
+        spread = (weight[:, :, None] * value[:, None]).reshape(-1, value.shape[1])
+        return value.new_zeros(rows, value.shape[1]).index_add(0, row.reshape(-1), spread)
+
+    def to_particles(self, value: Tensor, row: Tensor, weight: Tensor) -> Tensor:
+        """Interpolated node values [N, F] of [A, F]: sum_i w_ip f_i."""
+        return (value.index_select(0, row.reshape(-1)).view(*row.shape, -1) * weight[:, :, None]).sum(1)
+
+    def node_features(self, density: Tensor, velocity: Tensor, node: Tensor, context: Tensor | None) -> Tensor:
+        """[A, inputs] of the density per type [A, types], the mean velocities [A, (history - 1) d], newest first, and the flat node ids.
+
+        Density; newest velocity / velocity scale; its differences to the older ones / acceleration scale; signed distance to each wall
+        in cells, clipped to +-wall_reach and divided by it; the normalised context of the node's example.
+        """
+        size, dim = self.grid.sizes[0], self.spec.dim
+        newest = velocity[:, :dim]
+        past = (velocity.view(-1, self.options.history - 1, dim)[:, :-1] - velocity.view(-1, self.options.history - 1, dim)[:, 1:]).flatten(1)
+        example, local = node // size, node % size
+        padded = torch.tensor(self.grid.shape, device=node.device) + 2
+        coordinate = (torch.div(local[:, None], self.grid.stride0, rounding_mode="floor") % padded - 1).float()
+        lower = coordinate - self.options.margin
+        upper = padded - 3 - self.options.margin - coordinate
+        walls = torch.cat([lower, upper], 1).clamp(-self.options.wall_reach, self.options.wall_reach) / self.options.wall_reach
+        parts = [density, newest / self.velocity_scale, past / self.acceleration_scale, walls]
+        if self.context:
+            parts.append(((context - self.context_mean) / self.context_std)[example])
+        return torch.cat(parts, 1)
+
+    def call(self, history: Tensor, kind: Tensor, example: Tensor, examples: int, context: Tensor | None = None) -> Tensor:
+        """The next m positions [m, N, d] of a history [history, N, d]; context [examples, c]. Kinematic particles come out unprescribed."""
+        dim, m = self.spec.dim, self.options.frames_per_call
+        position = history[-1]
+        velocity = (history[1:] - history[:-1]).flip(0).transpose(0, 1).flatten(1)
+        newest = velocity[:, :dim]
+        node, weight = self.weights(position, example)
+        occupied, rows, levels = self.grid.occupy(node, examples)
+        row = rows[node]
+        types = torch.tensor(self.spec.particle_types, device=kind.device)
+        one_hot = (kind[:, None] == types).to(position.dtype)
+        sums = self.to_grid(torch.cat([one_hot, velocity], 1), row, weight, len(occupied))
+        mass, momentum = sums[:, : len(types)], sums[:, len(types) :]
+        mean = momentum / (mass.sum(1, keepdim=True) + 1e-3)
+        features = self.node_features(mass * self.particle_mass, mean, occupied, context)
+        output = self.network(features, levels)
+        output = torch.cat([output[:, : m * dim], output[:, m * dim :], mean[:, :dim]], 1)
+        read = self.to_particles(output, row, weight)
+        deviation = read[:, : m * dim].view(-1, m, dim) * self.frame_scale[:, None]
+        blend = read[:, m * dim : m * dim + 1] * (read[:, m * dim + 1 :] - newest)
+        velocities = (newest + blend)[:, None] + self.gravity * self.axis + deviation
+        return position + velocities.cumsum(1).transpose(0, 1)
+
+    # ---- training -------------------------------------------------------------------------------------------------------------------
+
+    def calls(self, progress: float) -> int:
+        """Calls unrolled at this share of the training."""
+        unroll = self.options.unroll
+        return unroll[min(int(progress * len(unroll)), len(unroll) - 1)]
+
+    def window(self, progress: float) -> int:
+        """Model frames of a training window: the history and ``calls`` blocks of m."""
+        return self.options.history + self.calls(progress) * self.options.frames_per_call
+
+    def loss(self, windows: Windows, generator: torch.Generator, progress: float) -> Tensor:
+        """Mean over calls, frames, moving particles and axes of |x - (x_true + e)|^2 / scale_j^2.
+
+        e: the noise of the last input position, so that the targets move with the noisy start; scale_j: the rms deviation of the
+        window's frame j of a call from ballistic flight, at least ``floor`` spacings (otherwise free flight would be all noise).
+        """
+        history, m = self.options.history, self.options.frames_per_call
+        moving = windows.particle_type != KINEMATIC_TYPE
+        noise = random_walk_noise(windows.position[:history], self.options.noise * self.velocity_std, moving, generator)
+        state = windows.position[:history] + noise
+        target = windows.position[history:] + noise[-1]
+        total = state.new_zeros(())
+        calls = target.shape[0] // m
+        for call in range(calls):
+            context = None if windows.context is None else windows.context[history - 1 + call * m]
+            future = self.call(state, windows.particle_type, windows.example, windows.examples, context)
+            truth = target[call * m : (call + 1) * m]
+            if self.fixed:
+                future = torch.where(moving[:, None], future, truth)
+            total = total + ((future - truth).square().mean(2) / self._scale(windows.position, call).square())[:, moving].mean()
+            state = torch.cat([state, future])[-history:]
+        return total / calls
+
+    def _scale(self, position: Tensor, call: int) -> Tensor:
+        """[m, 1]: rms deviation of the true frames of a call from ballistic flight, floored."""
+        history, m = self.options.history, self.options.frames_per_call
+        now = history - 1 + call * m
+        velocity = position[now] - position[now - 1]
+        flight = position[now] + (velocity + self.gravity * (self.axis[:, None] + 1) / 2) * self.axis[:, None]
+        return (position[now + 1 : now + 1 + m] - flight).square().mean((1, 2)).sqrt().clamp(min=self.options.floor * self.spec.spacing)[:, None]
+
+    # ---- simulation -----------------------------------------------------------------------------------------------------------------
+
+    def begin(self, start: Start) -> None:
+        """Load the last ``history`` model frames of the start."""
+        device = self.bounds.device
+        known = np.ascontiguousarray(start.history[-self.history :: self.spec.stride], np.float32)
+        self._state = torch.from_numpy(known).to(device)
+        self._kind = torch.as_tensor(start.particle_type, dtype=torch.int64, device=device)
+        self._example = torch.zeros_like(self._kind)
+        self._frame = start.present
+        self._context = None if start.context is None else torch.as_tensor(start.context, dtype=torch.float32, device=device)
+        self._kinematic = None if start.kinematic is None else torch.as_tensor(start.kinematic, dtype=torch.float32, device=device)
+
+    @torch.inference_mode()
+    def advance(self) -> np.ndarray:
+        """The next m * stride file frames [m * stride, particles, dim], linear between model frames."""
+        stride = self.spec.stride
+        context = self._context[self._frame : self._frame + 1] if self.context else None
+        future = self.call(self._state, self._kind, self._example, 1, context)
+        if self._kinematic is not None:
+            frames = self._frame + stride * torch.arange(1, len(future) + 1, device=future.device)
+            future[:, self._kind == KINEMATIC_TYPE] = self._kinematic[frames.clamp(max=len(self._kinematic) - 1)]
+        before = torch.cat([self._state[-1:], future[:-1]])
+        self._state = torch.cat([self._state, future])[-self.options.history :]
+        self._frame += stride * len(future)
+        if stride > 1:
+            share = torch.arange(1, stride + 1, device=future.device).view(1, -1, 1, 1) / stride
+            future = (before[:, None] + share * (future - before)[:, None]).flatten(0, 1)
+        return future.cpu().numpy()

@@ -1,0 +1,359 @@
+"""How far a predicted rollout is from the true one, particle by particle and as a cloud.
+
+Every function is pure numpy/scipy in float64. Positions are [frames, particles, dim] in container units [length]; frame 0 of a
+rollout is the first *predicted* frame. Three values are not numbers and mean different things: ``None`` is undefined (a horizon longer than
+the rollout, a pile height without gravity), ``inf`` is "never" (divergence time, first non-finite frame), ``nan`` is a failed rollout.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
+
+from sim.trajectory import Trajectory
+
+HORIZONS = (1, 5, 20, 100)
+#: Shares of the rollout at which clouds are compared (the last is its last frame).
+CLOUD_TIMES = (0.25, 0.5, 0.75, 1.0)
+SUBSAMPLE_SEED = 0
+
+
+# Particle by particle -------------------------------------------------------------------------------------------------------
+
+
+def frame_mse(predicted: np.ndarray, true: np.ndarray) -> np.ndarray:
+    """Mean over particles and axes of (p - q)^2 in every frame, [frames], length^2; NaN where the prediction is."""
+    return ((np.asarray(predicted, float) - np.asarray(true, float)) ** 2).mean(axis=(1, 2))
+
+
+def one_step_mse(predicted: np.ndarray, true: np.ndarray) -> float:
+    """Mean over samples, particles and axes of (p - q)^2, length^2: [samples, particles, dim] single steps, each from true history."""
+    return float(frame_mse(predicted, true).mean())
+
+
+def rollout_mse(predicted: np.ndarray, true: np.ndarray, horizons: tuple[int, ...] = HORIZONS) -> dict[str, float | None]:
+    """Mean over the first h frames, all particles and axes of (p - q)^2, length^2, for every h and "all" (Sanchez-Gonzalez et al. 2020).
+
+    Give moving particles only to keep static obstacles, which count as zeros, out of the mean. None where the rollout is shorter than h.
+    """
+    error = frame_mse(predicted, true)
+    result: dict[str, float | None] = {str(h): float(error[:h].mean()) if h <= len(error) else None for h in horizons}
+    return result | {"all": float(error.mean())}
+
+
+def rms_distance(predicted: np.ndarray, true: np.ndarray) -> np.ndarray:
+    """sqrt(mean over particles of |p - q|^2) in every frame, [frames], length."""
+    return np.sqrt(frame_mse(predicted, true) * predicted.shape[2])
+
+
+def divergence_time(predicted: np.ndarray, true: np.ndarray, radius: float, frame_step: float) -> float:
+    """First time [s] after the start at which the RMS particle distance exceeds the connectivity radius or is not finite; inf if never."""
+    beyond = ~(rms_distance(predicted, true) <= radius)
+    return float((np.argmax(beyond) + 1) * frame_step) if beyond.any() else math.inf
+
+
+def first_non_finite(predicted: np.ndarray) -> float:
+    """Number, counted from 1, of the first predicted frame with a non-finite position; inf if there is none."""
+    broken = ~np.isfinite(predicted).all(axis=(1, 2))
+    return float(np.argmax(broken) + 1) if broken.any() else math.inf
+
+
+def escaped_fraction(position: np.ndarray, bounds: np.ndarray) -> np.ndarray:
+    """Share of the particles outside the container in every frame, [frames]; NaN in non-finite frames. Nothing is clamped first.
+
+    bounds [dim, 2]. Float32 storage rounds a particle on the wall to either side, so 1e-6 of the edge is allowed.
+    """
+    position, bounds = np.asarray(position, float), np.asarray(bounds, float)
+    slack = 1e-6 * (bounds[:, 1] - bounds[:, 0])
+    outside = ((position < bounds[:, 0] - slack) | (position > bounds[:, 1] + slack)).any(axis=2).mean(axis=1)
+    return np.where(np.isfinite(position).all(axis=(1, 2)), outside, np.nan)
+
+
+# Energy and momentum --------------------------------------------------------------------------------------------------------
+
+
+def velocities(position: np.ndarray, before: np.ndarray, frame_step: float) -> np.ndarray:
+    """(p_t - p_(t-1)) / frame_step, [frames, particles, dim], length / s; ``before`` [particles, dim] precedes the first frame."""
+    return np.diff(np.concatenate([before[None], position]).astype(float), axis=0) / frame_step
+
+
+def kinetic_energy(velocity: np.ndarray) -> np.ndarray:
+    """Kinetic energy per unit mass, mean over particles of |v|^2 / 2, in every frame: [frames], length^2 / s^2."""
+    return 0.5 * (np.asarray(velocity, float) ** 2).sum(axis=2).mean(axis=1)
+
+
+def kinetic_energy_mse(velocity: np.ndarray, true_velocity: np.ndarray) -> float:
+    """Mean over frames of the squared difference of the kinetic energies per unit mass, length^4 / s^4 (Toshev et al. 2023)."""
+    return float(((kinetic_energy(velocity) - kinetic_energy(true_velocity)) ** 2).mean())
+
+
+def momentum_drift(velocity: np.ndarray, true_velocity: np.ndarray) -> float | None:
+    """Largest over frames of |P - P_true| / M, over the root mean square true speed: dimensionless, equal particle masses.
+
+    Walls and gravity change the true momentum, so it is the difference from the truth that is a drift. None if nothing truly moves.
+    """
+    speed = math.sqrt((np.asarray(true_velocity, float) ** 2).sum(axis=2).mean())
+    drift = np.linalg.norm(np.asarray(velocity, float).mean(axis=1) - np.asarray(true_velocity, float).mean(axis=1), axis=1)
+    return float(drift.max() / speed) if speed > 0 else None
+
+
+# Clouds: position [particles, dim] ------------------------------------------------------------------------------------------
+
+
+def subsample(count: int, limit: int) -> np.ndarray:
+    """Sorted indices of at most ``limit`` of ``count`` particles, drawn with ``SUBSAMPLE_SEED``: the same particles in every cloud."""
+    if count <= limit:
+        return np.arange(count)
+    return np.sort(np.random.default_rng(SUBSAMPLE_SEED).choice(count, limit, replace=False))
+
+
+def earth_movers_distance(p: np.ndarray, q: np.ndarray, spacing: float) -> float:
+    """Exact Wasserstein-1 distance of two equally large clouds, min over matchings of mean |p_i - q_s(i)|, in particle spacings."""
+    cost = cdist(np.asarray(p, float), np.asarray(q, float))
+    return float(cost[linear_sum_assignment(cost)].mean() / spacing)
+
+
+def _soft_minimum(cost: np.ndarray, potential: np.ndarray, epsilon: float) -> np.ndarray:
+    """-epsilon log(mean_j exp((potential_j - cost_ij) / epsilon)): one Sinkhorn half step in the log domain."""
+    exponent = (potential - cost) / epsilon
+    peak = exponent.max(axis=1)
+    return -epsilon * (peak + np.log(np.exp(exponent - peak[:, None]).mean(axis=1)))
+
+
+#: Sinkhorn stops when the rows of the plan miss their marginals by this share of the mass.
+_MARGINAL_TOLERANCE = 1e-6
+_SINKHORN_BLOCKS, _SINKHORN_BLOCK = 100, 50
+
+
+def entropic_transport(p: np.ndarray, q: np.ndarray, epsilon: float) -> float:
+    """OT(p, q) = min over plans of <plan, |p_i - q_j|^2> + epsilon KL(plan | uniform product), length^2; NaN if it does not converge.
+
+    Uniform weights. The potentials live in the log domain; epsilon is first lowered from the squared diameter, and blocks of plain scaling
+    steps run on the kernel that has absorbed the potentials (Schmitzer 2019): two matrix-vector products instead of two sums of exponentials.
+    """
+    cost = cdist(np.asarray(p, float), np.asarray(q, float), "sqeuclidean")
+    rows, columns = cost.shape
+    f, g = np.zeros(rows), np.zeros(columns)
+    scale = max(float(cost.max()), epsilon)
+    while True:
+        f = _soft_minimum(cost, g, scale)
+        g = _soft_minimum(cost.T, f, scale)
+        if scale == epsilon:
+            break
+        scale = max(scale / 4, epsilon)
+    for _ in range(_SINKHORN_BLOCKS):
+        kernel = np.exp((f[:, None] + g - cost) / epsilon) / columns
+        u, v = np.ones(rows), np.ones(columns)
+        with np.errstate(all="ignore"):
+            for _ in range(_SINKHORN_BLOCK):
+                u = 1 / (kernel @ v)
+                v = rows / columns / (u @ kernel)
+            miss = np.abs(u * (kernel @ v) - 1).mean()
+            shift_f, shift_g = epsilon * np.log(u), epsilon * np.log(v)
+        if np.isfinite(shift_f).all() and np.isfinite(shift_g).all():
+            f, g = f + shift_f, g + shift_g
+            if miss < _MARGINAL_TOLERANCE:
+                # The column marginals hold exactly after the last half step, so the dual objective is the sum of the means.
+                return float(f.mean() + g.mean())
+        else:  # the kernel underflowed in a whole row: a log-domain step always moves on
+            f = _soft_minimum(cost, g, epsilon)
+            g = _soft_minimum(cost.T, f, epsilon)
+    return math.nan
+
+
+def _self_transport(p: np.ndarray, epsilon: float) -> float:
+    """OT(p, p) with one potential; the averaged step converges in tens of iterations (Feydy et al. 2019).
+
+    No log domain is needed: the kernel's diagonal is 1, so that the scalings stay between 1/n and sqrt(n).
+    """
+    kernel = np.exp(-cdist(np.asarray(p, float), np.asarray(p, float), "sqeuclidean") / epsilon) / len(p)
+    u = np.ones(len(p))
+    for _ in range(10_000):
+        update = np.sqrt(u / (kernel @ u))
+        change = np.abs(np.log(update / u)).max()
+        u = update
+        if change < _MARGINAL_TOLERANCE:
+            return float(2 * epsilon * np.log(u).mean())
+    return math.nan
+
+
+def sinkhorn_divergence(p: np.ndarray, q: np.ndarray, epsilon: float) -> float:
+    """OT(p, q) - OT(p, p) / 2 - OT(q, q) / 2, length^2: >= 0, zero for equal clouds, |t|^2 for a cloud moved by t (Feydy et al. 2019).
+
+    p [n, dim], q [m, dim]; uniform weights, squared distance; epsilon [length^2] is the entropic blur squared. Converged until the marginals
+    hold to 1e-6 of the mass; NaN if that cannot be reached.
+    """
+    return entropic_transport(p, q, epsilon) - 0.5 * (_self_transport(p, epsilon) + _self_transport(q, epsilon))
+
+
+def density(position: np.ndarray, bounds: np.ndarray, cell: float, spacing: float) -> np.ndarray:
+    """Volume fraction at the nodes of a grid over the container: bilinear deposit of spacing^dim a particle, over cell^dim.
+
+    [nodes, ...], 1 inside a cloud at rest and half of it on a wall; particles outside the container are left out.
+    """
+    position, bounds = np.asarray(position, float), np.asarray(bounds, float)
+    nodes = np.ceil((bounds[:, 1] - bounds[:, 0]) / cell - 1e-9).astype(int) + 1
+    position = position[((position >= bounds[:, 0]) & (position <= bounds[:, 1])).all(axis=1)]
+    base = (position - bounds[:, 0]) / cell
+    corner = np.minimum(base.astype(int), nodes - 2)
+    share = base - corner
+    grid = np.zeros(nodes)
+    for offset in np.ndindex(*(2,) * position.shape[1]):
+        weight = np.where(offset, share, 1 - share).prod(axis=1)
+        np.add.at(grid, tuple((corner + offset).T), weight)
+    return grid * (spacing / cell) ** position.shape[1]
+
+
+def density_error(p: np.ndarray, q: np.ndarray, bounds: np.ndarray, spacing: float) -> tuple[float, float]:
+    """(mean, max) of |density(p) - density(q)| over the nodes where either is not zero; grid of two spacings, in rest densities."""
+    first, second = (density(cloud, bounds, 2 * spacing, spacing) for cloud in (p, q))
+    used = (first > 0) | (second > 0)
+    difference = np.abs(first - second)[used]
+    return (float(difference.mean()), float(difference.max())) if used.any() else (0.0, 0.0)
+
+
+def spacing_ratio(p: np.ndarray, q: np.ndarray) -> float | None:
+    """Mean nearest-neighbour distance in p over that in q (0.85-1.15 looks right, less is clumping); None below two particles."""
+    if len(p) < 2 or len(q) < 2:
+        return None
+    nearest = [cKDTree(np.asarray(cloud, float)).query(np.asarray(cloud, float), k=2)[0][:, 1].mean() for cloud in (p, q)]
+    return float(nearest[0] / nearest[1]) if nearest[1] > 0 else None
+
+
+def centre_of_mass_error(p: np.ndarray, q: np.ndarray, spacing: float) -> float:
+    """|mean p - mean q| in particle spacings, equal masses."""
+    return float(np.linalg.norm(np.asarray(p, float).mean(axis=0) - np.asarray(q, float).mean(axis=0)) / spacing)
+
+
+#: Extents are taken between these quantiles, so that one stray drop is not the front.
+_EXTENT_QUANTILES = (0.01, 0.99)
+
+
+def vertical_axis(gravity: np.ndarray) -> int | None:
+    """The axis along which gravity is strongest; None without gravity."""
+    gravity = np.abs(np.asarray(gravity, float))
+    return int(np.argmax(gravity)) if gravity.any() else None
+
+
+def _height(position: np.ndarray, bounds: np.ndarray, gravity: np.ndarray) -> np.ndarray:
+    """Height of every particle above the floor, the face that gravity points to, [particles]."""
+    axis = vertical_axis(gravity)
+    down = float(np.sign(gravity[axis]))
+    return down * (bounds[axis, int(down > 0)] - np.asarray(position, float)[:, axis])
+
+
+def front(position: np.ndarray, gravity: np.ndarray) -> float:
+    """Front position [length]: 99 % quantile along the first horizontal axis."""
+    axis = 1 if vertical_axis(gravity) == 0 else 0
+    return float(np.quantile(np.asarray(position, float)[:, axis], _EXTENT_QUANTILES[1]))
+
+
+def width(position: np.ndarray, gravity: np.ndarray) -> float:
+    """Run-out [length]: the larger of the horizontal extents between the 1 % and 99 % quantiles."""
+    horizontal = [axis for axis in range(position.shape[1]) if axis != vertical_axis(gravity)]
+    low, high = np.quantile(np.asarray(position, float)[:, horizontal], _EXTENT_QUANTILES, axis=0)
+    return float((high - low).max())
+
+
+def pile_height(position: np.ndarray, bounds: np.ndarray, gravity: np.ndarray) -> float | None:
+    """99 % quantile of the height above the floor [length]; None without gravity."""
+    return None if vertical_axis(gravity) is None else float(np.quantile(_height(position, bounds, gravity), _EXTENT_QUANTILES[1]))
+
+
+def pile_angle(position: np.ndarray, bounds: np.ndarray, gravity: np.ndarray, spacing: float) -> float | None:
+    """Slope of the surface in degrees: least squares of the height of the highest particle of each column over its distance from the axis.
+
+    Columns are two spacings wide and the axis goes through the centre of mass, so a pile that leans on a wall reads low. None without
+    gravity or with fewer than three columns.
+    """
+    axis = vertical_axis(gravity)
+    if axis is None:
+        return None
+    horizontal = np.delete(np.asarray(position, float), axis, axis=1)
+    height = _height(position, bounds, gravity)
+    order = np.argsort(-height, kind="stable")
+    _, first = np.unique(np.floor(horizontal[order] / (2 * spacing)), axis=0, return_index=True)
+    top = order[first]
+    distance = np.linalg.norm(horizontal[top] - horizontal.mean(axis=0), axis=1)
+    if len(top) < 3 or np.ptp(distance) == 0:
+        return None
+    return float(np.degrees(np.arctan(-np.polyfit(distance, height[top], 1)[0])))
+
+
+# All of it ------------------------------------------------------------------------------------------------------------------
+
+
+def cloud_metrics(p: np.ndarray, q: np.ndarray, trajectory: Trajectory, *, emd_particles: int = 500, sinkhorn_particles: int = 500) -> dict:
+    """Every cloud metric of one predicted frame p against the true one q, both [particles, dim], moving particles; NaN if p is not finite.
+
+    ``sinkhorn`` has epsilon = R^2; clouds above the given sizes are subsampled for it and for ``emd``; ratios are predicted over true;
+    ``front_error``, ``centre_of_mass_error`` and ``emd`` in spacings, ``pile_angle_error`` in degrees.
+    """
+    spacing, bounds, gravity = float(trajectory.scene["spacing"]), trajectory.bounds, np.asarray(trajectory.scene["gravity"], float)
+    names = (
+        "sinkhorn", "emd", "spacing_ratio", "density_error_mean", "density_error_max", "centre_of_mass_error", "front_error",
+        "width_ratio", "height_ratio", "pile_angle_error",
+    )
+    if not np.isfinite(p).all():
+        return dict.fromkeys(names, math.nan)
+
+    def ratio(predicted: float | None, true: float | None) -> float | None:
+        return None if predicted is None or not true else predicted / true
+
+    few, some = subsample(len(p), sinkhorn_particles), subsample(len(p), emd_particles)
+    mean, largest = density_error(p, q, bounds, spacing)
+    angles = [pile_angle(cloud, bounds, gravity, spacing) for cloud in (p, q)]
+    values = (
+        sinkhorn_divergence(p[few], q[few], trajectory.radius**2),
+        earth_movers_distance(p[some], q[some], spacing),
+        spacing_ratio(p, q),
+        mean,
+        largest,
+        centre_of_mass_error(p, q, spacing),
+        abs(front(p, gravity) - front(q, gravity)) / spacing,
+        ratio(width(p, gravity), width(q, gravity)),
+        ratio(pile_height(p, bounds, gravity), pile_height(q, bounds, gravity)),
+        None if None in angles else abs(angles[0] - angles[1]),
+    )
+    return dict(zip(names, values, strict=True))
+
+
+def evaluate(
+    predicted: np.ndarray, trajectory: Trajectory, present: int, *, horizons: tuple[int, ...] = HORIZONS,
+    emd_particles: int = 500, sinkhorn_particles: int = 500,
+) -> dict:
+    """Every metric of one rollout: predicted [frames, particles, dim] are the frames after ``present`` of the true trajectory.
+
+    Keys hold a number, or a dict by horizon ("1", ..., "all") or by share of the rollout ("0.25", ..., "1"); units as in the functions above,
+    ``..._per_radius2`` and ``..._per_edge2`` (longest container edge) without unit. The clouds, energies and escapes are of the moving particles.
+    """
+    moving = trajectory.moving
+    true = trajectory.position[present + 1 : present + 1 + len(predicted)]
+    p, q = predicted[:, moving], true[:, moving]
+    edge = float((trajectory.bounds[:, 1] - trajectory.bounds[:, 0]).max())
+    everything, only_moving = rollout_mse(predicted, true, horizons), rollout_mse(p, q, horizons)
+    before = trajectory.position[present, moving]
+    velocity, true_velocity = velocities(p, before, trajectory.frame_step), velocities(q, before, trajectory.frame_step)
+    escaped = escaped_fraction(p, trajectory.bounds)
+    result = {
+        "rollout_mse": everything,
+        "rollout_mse_moving": only_moving,
+        "rollout_mse_per_radius2": {key: None if value is None else value / trajectory.radius**2 for key, value in everything.items()},
+        "rollout_mse_per_edge2": {key: None if value is None else value / edge**2 for key, value in everything.items()},
+        "kinetic_energy_mse": kinetic_energy_mse(velocity, true_velocity),
+        "momentum_drift": momentum_drift(velocity, true_velocity),
+        "escaped_fraction": float(escaped[-1]),
+        "escaped_fraction_worst": float(escaped.max()),
+        "first_non_finite": first_non_finite(predicted),
+        "divergence_time": divergence_time(p, q, trajectory.radius, trajectory.frame_step),
+    }
+    for share in CLOUD_TIMES:
+        frame = max(math.ceil(share * len(p)) - 1, 0)
+        clouds = cloud_metrics(p[frame], q[frame], trajectory, emd_particles=emd_particles, sinkhorn_particles=sinkhorn_particles)
+        for name, value in clouds.items():
+            result.setdefault(name, {})[f"{share:g}"] = value
+    return result

@@ -1,0 +1,501 @@
+"""Training of any registered model: windows in a global shuffle, Adam, weight averaging, validation by rollout, resuming.
+
+A run folder holds ``checkpoint.pt`` (all that resuming needs), ``best.pt`` (the averaged weights with the smallest rollout error: all
+that inference needs), ``log.csv``, ``validation.csv`` and, at the end, ``done.json``. With a budget in steps, on a CPU with one thread, a
+run that is killed at any instant and started again ends bitwise where the unbroken run ends.
+
+Decision: a budget in minutes counts everything from the first step's preparation on, validation included, because that is what a user
+waits for; only the last validation may exceed it. Progress is then elapsed / budget, so such a run is resumed, but not bitwise.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+from torch import nn
+from tqdm import tqdm
+
+from learn.checkpoint import STATE_KEYS, build_model, load_state, save_model, save_state, validate
+from learn.dataset import Dataset, DataSettings, Sampler
+from learn.metrics import frame_mse, spacing_ratio
+from sim import __version__
+from sim.errors import InputError, RunError
+from sim.simulator import rollout, start_from
+from sim.trajectory import Trajectory, write_json, write_text
+
+LOG_COLUMNS = ("step", "seconds", "loss", "learning_rate", "gradient_norm", "window")
+VALIDATION_COLUMNS = ("step", "seconds", "rollout_mse", "spacing_ratio", "finished", "best")
+
+
+class TrainSettings(BaseModel):
+    """How a model is trained. Exactly one of ``steps`` and ``minutes`` is the budget."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    steps: int | None = Field(None, ge=1)  # budget in optimiser steps
+    minutes: float | None = Field(None, gt=0, allow_inf_nan=False)  # budget in minutes of wall time, validation included
+    batch: int = Field(2, ge=1)  # windows a step
+    learning_rate: float = Field(1e-4, gt=0, allow_inf_nan=False)
+    final_learning_rate: float = Field(1e-6, ge=0, allow_inf_nan=False)  # floor of the schedule
+    schedule: Literal["cosine", "exponential"] = "cosine"  # over the budget; or the paper's decay over steps
+    decay_steps: int = Field(5_000_000, ge=1)  # exponential only: steps in which the learning rate falls tenfold
+    warmup_steps: int = Field(100, ge=0)  # steps of linear warm-up
+    gradient_clip: float | None = Field(1.0, gt=0, allow_inf_nan=False)  # largest norm of the whole gradient; null: none
+    weight_decay: float = Field(0.0, ge=0, allow_inf_nan=False)  # decoupled (AdamW); 0 is Adam
+    average_decay: float = Field(0.999, ge=0, lt=1)  # of the exponential average of the weights; 0: none
+    validations: int = Field(10, ge=1)  # evenly over the budget, the last at its end
+    validate_every: int | None = Field(None, ge=1)  # steps; instead of ``validations``
+    validation_trajectories: int = Field(5, ge=1)  # the first ones of the validation split
+    validation_frames: int | None = Field(None, ge=1)  # length of a validation rollout; null: to the end of the trajectory
+    log_every: int = Field(50, ge=1)  # steps a row of log.csv
+    checkpoint_seconds: float = Field(60.0, gt=0)  # at most this much work is lost by a kill ...
+    checkpoint_every: int | None = Field(None, ge=1)  # ... and a checkpoint also every so many steps
+    seed: int = Field(0, ge=0, lt=2**63)
+    threads: int = Field(1, ge=1, le=1024)  # CPU threads; resuming is bitwise with one
+    device: Literal["auto", "cpu", "cuda"] = "auto"  # auto: cuda where there is one
+
+    @model_validator(mode="after")
+    def _one_budget(self) -> TrainSettings:
+        if (self.steps is None) == (self.minutes is None):
+            raise ValueError("give exactly one of steps and minutes")
+        if self.final_learning_rate > self.learning_rate:
+            raise ValueError("final_learning_rate must not exceed learning_rate")
+        return self
+
+    def rate(self, step: int, progress: float) -> float:
+        """Learning rate of step ``step`` (from 0) at ``progress`` (0..1) of the budget, r0 = ``learning_rate``, r1 = ``final_learning_rate``.
+
+        cosine: r1 + (r0 - r1) (1 + cos(pi progress)) / 2; exponential (Sanchez-Gonzalez et al. 2020): r1 + (r0 - r1) 0.1^(step / decay_steps);
+        both times min(1, (step + 1) / warmup_steps).
+        """
+        if self.schedule == "cosine":
+            share = (1 + math.cos(math.pi * min(progress, 1.0))) / 2
+        else:
+            share = 0.1 ** (step / self.decay_steps)
+        warm = min(1.0, (step + 1) / self.warmup_steps) if self.warmup_steps else 1.0
+        return warm * (self.final_learning_rate + (self.learning_rate - self.final_learning_rate) * share)
+
+
+class Config(BaseModel):
+    """A file of ``configs/models/``: which model, its settings, how it is trained, how windows are drawn."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    model: str
+    settings: dict = {}
+    training: TrainSettings
+    data: DataSettings = DataSettings()
+
+
+def load_config(path: str | Path, overrides: dict | None = None) -> Config:
+    """Read and check a configuration file; ``overrides`` replace keys of ``training`` (a budget replaces the other kind of budget).
+
+    Every fault is an ``InputError``. The model's own settings are checked when the model is built.
+    """
+    path = Path(path)
+    try:
+        content = yaml.safe_load(path.read_text())
+    except OSError as error:
+        raise InputError(path, "file", error.strerror, "not readable; correct the path") from None
+    except (yaml.YAMLError, UnicodeDecodeError, RecursionError, ValueError) as error:
+        raise InputError(path, "file", str(error), "not YAML; correct it") from None
+    if not isinstance(content, dict):
+        raise InputError(path, "file", type(content).__name__, "must be a mapping with the keys model, settings, training, data")
+    if overrides and isinstance(content.get("training"), dict):
+        training = dict(content["training"])
+        if {"steps", "minutes"} & set(overrides):
+            training.pop("steps", None)
+            training.pop("minutes", None)
+        content = {**content, "training": {**training, **overrides}}
+    return validate(Config, content, path, "")
+
+
+def resolve_device(name: str, where: object) -> torch.device:
+    """The torch device of ``auto``, ``cpu`` or ``cuda``; ``InputError`` where there is no CUDA device."""
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    if name == "cuda" and not torch.cuda.is_available():
+        raise InputError(where, "device", name, "this machine has no CUDA device that torch can use; choose cpu or auto")
+    return torch.device(name)
+
+
+class _Interrupted(Exception):
+    """A signal asked the run to stop."""
+
+
+class _Table:
+    """A CSV file that only grows, and can be cut back to a step."""
+
+    def __init__(self, path: Path, columns: tuple[str, ...], step: int):
+        """Open ``path``, keeping the rows of an earlier run up to ``step``."""
+        rows = []
+        if step > 0 and path.is_file():
+            for row in csv.reader(io.StringIO(path.read_text())):
+                if len(row) == len(columns) and row[0].isdigit() and int(row[0]) <= step:
+                    rows.append(row)
+        text = io.StringIO()
+        csv.writer(text, lineterminator="\n").writerows([columns, *rows])
+        write_text(path, text.getvalue())
+        self._file = open(path, "a", newline="")  # noqa: SIM115 (open as long as the run)
+        self._writer = csv.writer(self._file, lineterminator="\n")
+
+    def add(self, *values: object) -> None:
+        self._writer.writerow(values)
+        self._file.flush()
+
+    def sync(self) -> None:
+        """Rows up to a checkpoint must reach the disk before it does."""
+        os.fsync(self._file.fileno())
+
+    def close(self) -> None:
+        self._file.close()
+
+
+class Trainer:
+    """One training run: construct (checks everything and writes nothing), then ``run()``.
+
+    data: folder of the data set with the splits ``train`` and ``valid``; run: the run folder; where: names the configuration in errors.
+    Raises ``InputError`` for faults of the input, among them a run folder that holds another run.
+    """
+
+    def __init__(self, config: Config, data: str | Path, run: str | Path, where: object = "config"):
+        self.config, self.settings, self.folder, self.where = config, config.training, Path(run), where
+        self.started = time.perf_counter()
+        self.device = resolve_device(self.settings.device, where)
+        torch.set_num_threads(self.settings.threads)
+        self.train_data, self.valid_data = Dataset(data, "train"), Dataset(data, "valid")
+        self.spec = self.train_data.spec(config.data.stride)
+        torch.manual_seed(self.settings.seed)
+        self.model = build_model(config.model, config.settings, self.spec, where).to(self.device)
+        self.parameters = [parameter for parameter in self.model.parameters() if parameter.requires_grad]
+        self.optimizer = torch.optim.AdamW(self.parameters, lr=self.settings.learning_rate, weight_decay=self.settings.weight_decay, fused=True)
+        self.average = {name: value.detach().clone() for name, value in self.model.state_dict().items()}
+        self.sampler = Sampler(self.train_data, config.data, self.settings.batch, self.settings.seed)
+        self.generator = torch.Generator().manual_seed(self.settings.seed)
+        self.progress_state = {
+            "step": 0, "seconds": 0.0, "validated_step": 0, "validations": 0, "best_mse": None, "best_step": None,
+            "loss_sum": 0.0, "norm_sum": 0.0, "logged": 0, "validation_seconds": 0.0,
+        }
+        self._check_lengths()
+        self._resume()
+        self._seconds_before = self.progress_state["seconds"]
+        self._stop: str | None = None
+        self._rolling = False
+
+    # -- set-up --------------------------------------------------------------------------------------------------------------
+
+    def _check_lengths(self) -> None:
+        """Windows and validation rollouts must fit in the trajectories, at the start of the training and at its end."""
+        for progress in (0.0, 1.0):
+            found = self.train_data.windows(self.model.window(progress), self.config.data.stride, self.config.data.skip_rest)
+            if len(found) < self.settings.batch:
+                raise InputError(self.where, "training.batch", self.settings.batch, f"the training split has only {len(found)} windows")
+        shortest = min(shape[0] for shape in self.valid_data.shapes[: self.settings.validation_trajectories])
+        if shortest <= self.model.history:
+            raise InputError(self.valid_data.path, "splits.valid", shortest, f"needs trajectories of more than {self.model.history} frames")
+
+    def _resume(self) -> None:
+        path = self.folder / "checkpoint.pt"
+        if not path.is_file():
+            return
+        state = load_state(path, "cpu")
+        for name, own in (("config", self._config_dict()), ("spec", json.loads(json.dumps(self.spec.to_dict())))):
+            if state[name] != own:
+                key = _first_difference(state[name], own)
+                remedy = f"the run in this folder was started with another {name} ({key}); give another --out, or delete the folder"
+                raise InputError(path, f"{name}.{key}", _at(own, key), remedy)
+        try:
+            self.model.load_state_dict(state["model"])
+            for name, value in self.average.items():
+                value.copy_(state["average"][name])
+            self.optimizer.load_state_dict(state["optimizer"])
+            self.sampler.restore(state["sampler"])
+            self.generator.set_state(state["generator"])
+            torch.set_rng_state(state["torch_random"])
+            if self.device.type == "cuda" and state["device_random"]:
+                torch.cuda.set_rng_state_all(state["device_random"])
+            self.progress_state = {name: state["progress"][name] for name in self.progress_state}
+        except (KeyError, ValueError, RuntimeError, TypeError, IndexError) as error:
+            if isinstance(error, InputError):
+                raise
+            raise InputError(path, "file", str(error), "damaged training state; delete the run folder and train again") from None
+
+    def _config_dict(self) -> dict:
+        return json.loads(json.dumps(self.config.model_dump(mode="json")))
+
+    # -- the loop ------------------------------------------------------------------------------------------------------------
+
+    @property
+    def step(self) -> int:
+        return self.progress_state["step"]
+
+    def seconds(self) -> float:
+        """Seconds since the run began, all its sessions together, without what a kill threw away."""
+        return self._seconds_before + time.perf_counter() - self.started
+
+    def progress(self) -> float:
+        """Share of the budget that is spent, 0..1."""
+        if self.settings.steps is not None:
+            return min(self.step / self.settings.steps, 1.0)
+        return min(self.seconds() / (60 * self.settings.minutes), 1.0)
+
+    def run(self) -> dict:
+        """Train to the end of the budget and return the content of ``done.json``.
+
+        Raises ``RunError`` on a loss that is not finite and after SIGTERM or SIGINT (a checkpoint is written first).
+        """
+        done = self.folder / "done.json"
+        if done.is_file() and self.step > 0 and self._finished_before(done):
+            return json.loads(done.read_text())
+        self.folder.mkdir(parents=True, exist_ok=True)
+        self.log = _Table(self.folder / "log.csv", LOG_COLUMNS, self.step)
+        self.validation = _Table(self.folder / "validation.csv", VALIDATION_COLUMNS, self.progress_state["validated_step"])
+        self._saved_at, self._printed_at = time.perf_counter(), -math.inf
+        self.trajectories = [self.valid_data.trajectory(number) for number in range(min(self.settings.validation_trajectories, len(self.valid_data)))]
+        try:
+            with self._signals(), self._bar():
+                self._loop()
+        except _Interrupted:
+            self._checkpoint()
+            message = f"{self.folder}: stopped by {self._stop} at step {self.step}; give the same command again to resume"
+            raise RunError(message) from None
+        finally:
+            self.log.close()
+            self.validation.close()
+        content = {
+            "steps": self.step, "seconds": self.seconds(), "validation_seconds": self.progress_state["validation_seconds"],
+            "best_rollout_mse": self.progress_state["best_mse"], "best_step": self.progress_state["best_step"],
+            "parameters": sum(parameter.numel() for parameter in self.parameters), "model": self.config.model,
+            "device": str(self.device), "threads": self.settings.threads, "config": self._config_dict(),
+        }
+        write_json(done, content)
+        return content
+
+    def _finished_before(self, done: Path) -> bool:
+        try:
+            return json.loads(done.read_text())["steps"] == self.step
+        except (ValueError, KeyError, TypeError):
+            return False
+
+    def _loop(self) -> None:
+        while True:
+            progress = self.progress()
+            if self._validation_due(progress):
+                self._validate()
+            if progress >= 1:
+                return
+            if self._stop:
+                raise _Interrupted
+            self._train_step(progress)
+            every = self.settings.checkpoint_every
+            if time.perf_counter() - self._saved_at >= self.settings.checkpoint_seconds or (every and self.step % every == 0):
+                self._checkpoint()
+
+    def _train_step(self, progress: float) -> None:
+        state, frames = self.progress_state, self.model.window(progress)
+        windows = self.sampler.next(frames).to(self.device)
+        rate = self.settings.rate(self.step, progress)
+        for group in self.optimizer.param_groups:
+            group["lr"] = rate
+        self.model.train()
+        loss = self.model.loss(windows, self.generator, progress)
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        norm = torch.nn.utils.clip_grad_norm_(self.parameters, self.settings.gradient_clip or math.inf)
+        loss_value, norm_value = float(loss.detach()), float(norm)
+        if not (math.isfinite(loss_value) and math.isfinite(norm_value)):
+            kept = "checkpoint.pt keeps good weights" if (self.folder / "checkpoint.pt").is_file() else "no checkpoint was written yet"
+            raise RunError(
+                f"{self.folder}: step {self.step}: loss = {loss_value}, gradient norm = {norm_value}: training diverged; {kept}; "
+                f"start again with a smaller training.learning_rate (now {self.settings.learning_rate:g})"
+            )
+        self.optimizer.step()
+        self._update_average()
+        state["step"] += 1
+        state["loss_sum"] += loss_value
+        state["norm_sum"] += norm_value
+        state["logged"] += 1
+        if self.step % self.settings.log_every == 0:
+            count = state["logged"]
+            mean = state["loss_sum"] / count
+            self.log.add(self.step, f"{self.seconds():.3f}", repr(mean), repr(rate), repr(state["norm_sum"] / count), frames)
+            state["loss_sum"], state["norm_sum"], state["logged"] = 0.0, 0.0, 0
+            self._show(mean, rate)
+
+    @torch.no_grad()
+    def _update_average(self) -> None:
+        """average <- d average + (1 - d) weights, d = min(decay, (1 + n) / (10 + n)) so that the first steps are soon forgotten."""
+        decay = min(self.settings.average_decay, (1 + self.step) / (10 + self.step)) if self.settings.average_decay else 0.0
+        current = self.model.state_dict()
+        averaged = [name for name, value in current.items() if value.is_floating_point()]
+        torch._foreach_lerp_([self.average[name] for name in averaged], [current[name] for name in averaged], 1 - decay)
+        for name in set(current) - set(averaged):
+            self.average[name].copy_(current[name])
+
+    @contextmanager
+    def _averaged(self) -> Iterator[nn.Module]:
+        """The model with the averaged weights, in evaluation mode."""
+        own = {name: value.detach().clone() for name, value in self.model.state_dict().items()}
+        self.model.load_state_dict(self.average)
+        self.model.eval()
+        try:
+            yield self.model
+        finally:
+            self.model.load_state_dict(own)
+            self.model.train()
+
+    # -- validation ----------------------------------------------------------------------------------------------------------
+
+    def _validation_due(self, progress: float) -> bool:
+        state = self.progress_state
+        if self.step == 0 or state["validated_step"] == self.step:
+            return False
+        if progress >= 1:
+            return True
+        if self.settings.validate_every:
+            return self.step % self.settings.validate_every == 0
+        return math.floor(progress * self.settings.validations) > state["validations"]
+
+    def _validate(self) -> None:
+        state, begun = self.progress_state, time.perf_counter()
+        with self._averaged() as model:
+            scores = []
+            for trajectory in self.trajectories:
+                if self._stop:
+                    raise _Interrupted
+                self._rolling = True
+                try:
+                    scores.append(rollout_score(model, trajectory, self.settings.validation_frames))
+                finally:
+                    self._rolling = False
+            mse = float(np.mean([score[0] for score in scores]))
+            ratio = float(np.mean([score[1] for score in scores]))
+            finished = float(np.mean([score[2] for score in scores]))
+            best = state["best_mse"] is None or mse < state["best_mse"]
+            state["validated_step"] = self.step
+            state["validations"] = math.floor(self.progress() * self.settings.validations)
+            state["validation_seconds"] += time.perf_counter() - begun
+            if best:
+                # JSON has no infinity: a model none of whose rollouts finished is the largest number.
+                state["best_mse"], state["best_step"] = min(mse, sys.float_info.max), self.step
+                save_model(self.folder / "best.pt", model, self._provenance())
+        self.validation.add(self.step, f"{self.seconds():.3f}", repr(mse), repr(ratio), repr(finished), int(best))
+        self._say(f"step {self.step}: validation rollout MSE {mse:.4g}, spacing ratio {ratio:.3f}{', best' if best else ''}")
+        self._checkpoint()
+
+    def _provenance(self) -> dict:
+        return {
+            "config": self._config_dict(), "step": self.step, "seconds": self.seconds(), "rollout_mse": self.progress_state["best_mse"],
+            "scene": self.train_data.content.get("scene"), "trajectories": len(self.train_data), "device": str(self.device),
+            "versions": {"sluice": __version__, "torch": torch.__version__},
+        }
+
+    # -- keeping -------------------------------------------------------------------------------------------------------------
+
+    def _checkpoint(self) -> None:
+        self.log.sync()
+        self.validation.sync()
+        self.progress_state["seconds"] = self.seconds()
+        state = {
+            "config": self._config_dict(), "spec": json.loads(json.dumps(self.spec.to_dict())), "model": self.model.state_dict(),
+            "average": self.average, "optimizer": self.optimizer.state_dict(), "sampler": self.sampler.state(),
+            "generator": self.generator.get_state(), "torch_random": torch.get_rng_state(),
+            "device_random": torch.cuda.get_rng_state_all() if self.device.type == "cuda" else [], "progress": dict(self.progress_state),
+        }
+        assert set(state) == set(STATE_KEYS)
+        save_state(self.folder / "checkpoint.pt", state)
+        self._saved_at = time.perf_counter()
+
+    @contextmanager
+    def _signals(self) -> Iterator[None]:
+        """SIGTERM and SIGINT end the current step, or break off the current validation rollout; both lead to a checkpoint."""
+        if threading.current_thread() is not threading.main_thread():
+            yield
+            return
+
+        def stop(number: int, _: object) -> None:
+            self._stop = signal.Signals(number).name
+            if self._rolling:
+                raise _Interrupted
+
+        before = {number: signal.signal(number, stop) for number in (signal.SIGTERM, signal.SIGINT)}
+        try:
+            yield
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+    # -- telling -------------------------------------------------------------------------------------------------------------
+
+    @contextmanager
+    def _bar(self) -> Iterator[None]:
+        """A progress bar in thousandths of the budget on a terminal, nothing elsewhere."""
+        bar = tqdm(total=1000, unit="", bar_format="{l_bar}{bar}| {elapsed}<{remaining}{postfix}") if sys.stderr.isatty() else nullcontext()
+        with bar as self._tqdm:
+            yield
+
+    def _show(self, loss: float, rate: float) -> None:
+        if self._tqdm is not None:
+            self._tqdm.n = round(1000 * self.progress())
+            self._tqdm.set_postfix_str(f"step {self.step}, loss {loss:.4g}")
+        elif time.perf_counter() - self._printed_at >= 10:
+            self._printed_at = time.perf_counter()
+            self._say(f"step {self.step} ({100 * self.progress():.0f} %, {self.seconds():.0f} s): loss {loss:.4g}, learning rate {rate:.3g}")
+
+    def _say(self, line: str) -> None:
+        tqdm.write(line, file=sys.stderr)
+
+
+@torch.no_grad()
+def rollout_score(model: nn.Module, trajectory: Trajectory, frames: int | None) -> tuple[float, float, float]:
+    """(MSE, spacing ratio, finished) of a rollout of ``frames`` frames (None: to the end) from the start of ``trajectory``.
+
+    MSE: mean over frames, moving particles and axes, length^2, infinite for a rollout that failed; spacing ratio: mean distance to
+    the nearest neighbour in the last frame, predicted over true, nan if failed; finished: 1 or 0.
+    """
+    truth = trajectory.position[model.history :][:frames]
+    result = rollout(model, start_from(trajectory, model.history), len(truth))
+    if result.status != "ok":
+        return math.inf, math.nan, 0.0
+    moving = trajectory.moving
+    predicted, truth = result.position[:, moving], truth[:, moving]
+    ratio = spacing_ratio(predicted[-1], truth[-1])
+    return float(frame_mse(predicted, truth).mean()), math.nan if ratio is None else ratio, 1.0
+
+
+def _first_difference(one: object, other: object) -> str:
+    """Dotted name of the first key in which two JSON-able dictionaries differ."""
+    if isinstance(one, dict) and isinstance(other, dict):
+        for key in sorted(set(one) | set(other)):
+            if key not in one or key not in other or one[key] != other[key]:
+                below = _first_difference(one.get(key), other.get(key))
+                return f"{key}.{below}" if below else str(key)
+    return ""
+
+
+def _at(content: object, key: str) -> object:
+    for part in key.split("."):
+        content = content.get(part) if isinstance(content, dict) else None
+    return content
+
+
+def train(config: Config, data: str | Path, run: str | Path, where: object = "config") -> dict:
+    """Train to the end of the budget, resuming what ``run`` holds; returns the content of ``done.json`` (see ``Trainer``)."""
+    return Trainer(config, data, run, where).run()
+
