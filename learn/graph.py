@@ -76,7 +76,8 @@ def radius_graph(position: Tensor, radius: float, example: Tensor | None = None)
     else:
         label = example.cpu().numpy()
         bounds = np.r_[0, np.flatnonzero(np.diff(label)) + 1, count]
-    pairs = np.concatenate([cKDTree(points[a:b]).query_pairs(radius, output_type="ndarray") + a for a, b in zip(bounds[:-1], bounds[1:], strict=True)])
+    trees = ((a, cKDTree(points[a:b])) for a, b in zip(bounds[:-1], bounds[1:], strict=True))
+    pairs = np.concatenate([tree.query_pairs(radius, output_type="ndarray") + a for a, tree in trees])
     low, high = pairs[:, 0], pairs[:, 1]
     key = np.concatenate([low * count + high, high * count + low, np.arange(count) * (count + 1)])
     key.sort()
