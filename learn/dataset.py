@@ -224,7 +224,7 @@ class Dataset:
                 if value != first[name]:
                     remedy = f"the first trajectory of the split has {first[name]}; one data set, one {name}"
                     raise InputError(reader.path, f"{index:06d}/{name}", value, remedy)
-        self._common = first
+        self.common = first
 
     def __len__(self) -> int:
         return len(self.entries)
@@ -273,7 +273,7 @@ class Dataset:
 
         Streams one trajectory at a time. Raises ``InputError`` where no trajectory has 2 k + 1 frames.
         """
-        dim = self._common["dim"]
+        dim = self.common["dim"]
         velocity, acceleration = _Moments(dim), _Moments(dim)
         for number, (frames, _, _) in enumerate(self.shapes):
             if frames <= 2 * stride:
@@ -292,7 +292,7 @@ class Dataset:
 
     def _given(self, name: str) -> list[float]:
         """[dim]: a statistic that the generator wrote, at stride 1."""
-        statistics, dim = self.content.get("statistics"), self._common["dim"]
+        statistics, dim = self.content.get("statistics"), self.common["dim"]
         value = statistics.get(name) if isinstance(statistics, dict) else None
         if not isinstance(value, list) or len(value) != dim or not all(isinstance(v, (int, float)) and math.isfinite(v) for v in value):
             raise InputError(self.path, f"statistics.{name}", value, f"must be {dim} finite numbers; generate the data set again")
@@ -324,7 +324,7 @@ class Dataset:
             context_mean, context_std = moments.mean.tolist(), moments.std.tolist()
         try:
             return DataSpec(
-                **train._common, stride=stride, particle_types=tuple(sorted(kinds)),
+                **train.common, stride=stride, particle_types=tuple(sorted(kinds)),
                 context_mean=context_mean, context_std=context_std, **statistics,
             )
         except ValueError as error:
@@ -374,7 +374,7 @@ class Dataset:
             if mirror is not None and mirror[row].any():
                 block = block.copy()  # never in place: the block may be the stored data
                 for axis in np.flatnonzero(mirror[row]):
-                    block[..., axis] = np.float32(sum(self._common["bounds"][axis])) - block[..., axis]
+                    block[..., axis] = np.float32(sum(self.common["bounds"][axis])) - block[..., axis]
             blocks.append(block)
             kinds.append(self.particle_type(number))
             context = self.context(number)
@@ -395,7 +395,7 @@ class Sampler:
 
     def __init__(self, dataset: Dataset, settings: DataSettings, batch: int, seed: int):
         self.dataset, self.settings, self.size, self.seed = dataset, settings, batch, seed
-        common = dataset._common
+        common = dataset.common
         self._flips = np.array([settings.mirror and g == 0 for g in common["gravity"]])
         if settings.mirror and dataset.context(0) is not None:
             raise InputError(dataset.path, "data.mirror", True, "a context cannot be mirrored; switch mirror off")

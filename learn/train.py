@@ -28,7 +28,8 @@ import numpy as np
 import torch
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, model_validator
-from torch import nn
+from torch import Tensor, nn
+from torch.optim.adam import adam
 from tqdm import tqdm
 
 from learn.checkpoint import STATE_KEYS, build_model, load_state, save_model, save_state, validate
@@ -135,6 +136,40 @@ def resolve_device(name: str, where: object) -> torch.device:
     return torch.device(name)
 
 
+class Adam:
+    """Adam (Kingma and Ba 2015) with decoupled weight decay (Loshchilov and Hutter 2019), one fused call a step.
+
+    m <- b1 m + (1 - b1) g; v <- b2 v + (1 - b2) g^2; w <- w - rate (m' / (sqrt(v') + eps) + weight_decay w), m' and v' without their start-up
+    bias; b1 = 0.9, b2 = 0.999, eps = 1e-8. ``torch.optim.AdamW`` calls the same function, but its constructor imports torch's compiler (7 s).
+    """
+
+    def __init__(self, parameters: list[nn.Parameter], weight_decay: float):
+        self.parameters, self.weight_decay = parameters, weight_decay
+        self.mean, self.square = ([torch.zeros_like(parameter) for parameter in parameters] for _ in range(2))
+        self.steps = [torch.zeros((), device=parameter.device) for parameter in parameters]
+
+    @torch.no_grad()
+    def step(self, rate: float) -> None:
+        """One step at learning rate ``rate``; parameters without a gradient stay."""
+        used = [k for k, parameter in enumerate(self.parameters) if parameter.grad is not None]
+        lists = (self.parameters, [parameter.grad for parameter in self.parameters], self.mean, self.square)
+        weights, gradients, mean, square = ([entries[k] for k in used] for entries in lists)
+        adam(
+            weights, gradients, mean, square, [], [self.steps[k] for k in used], fused=True, amsgrad=False, maximize=False,
+            beta1=0.9, beta2=0.999, eps=1e-8, lr=rate, weight_decay=self.weight_decay, decoupled_weight_decay=True,
+        )
+
+    def state(self) -> dict[str, list[Tensor]]:
+        """What ``restore`` needs."""
+        return {"mean": self.mean, "square": self.square, "steps": self.steps}
+
+    def restore(self, state: dict[str, list[Tensor]]) -> None:
+        """Continue from ``state``; ``ValueError`` or ``RuntimeError`` if it is another model's."""
+        for own, given in ((self.mean, state["mean"]), (self.square, state["square"]), (self.steps, state["steps"])):
+            for value, entry in zip(own, given, strict=True):
+                value.copy_(entry)
+
+
 class _Interrupted(Exception):
     """A signal asked the run to stop."""
 
@@ -184,7 +219,7 @@ class Trainer:
         torch.manual_seed(self.settings.seed)
         self.model = build_model(config.model, config.settings, self.spec, where).to(self.device)
         self.parameters = [parameter for parameter in self.model.parameters() if parameter.requires_grad]
-        self.optimizer = torch.optim.AdamW(self.parameters, lr=self.settings.learning_rate, weight_decay=self.settings.weight_decay, fused=True)
+        self.optimizer = Adam(self.parameters, self.settings.weight_decay)
         self.average = {name: value.detach().clone() for name, value in self.model.state_dict().items()}
         self.sampler = Sampler(self.train_data, config.data, self.settings.batch, self.settings.seed)
         self.generator = torch.Generator().manual_seed(self.settings.seed)
@@ -224,7 +259,7 @@ class Trainer:
             self.model.load_state_dict(state["model"])
             for name, value in self.average.items():
                 value.copy_(state["average"][name])
-            self.optimizer.load_state_dict(state["optimizer"])
+            self.optimizer.restore(state["optimizer"])
             self.sampler.restore(state["sampler"])
             self.generator.set_state(state["generator"])
             torch.set_rng_state(state["torch_random"])
@@ -268,6 +303,7 @@ class Trainer:
         self.validation = _Table(self.folder / "validation.csv", VALIDATION_COLUMNS, self.progress_state["validated_step"])
         self._saved_at, self._printed_at = time.perf_counter(), -math.inf
         self.trajectories = [self.valid_data.trajectory(number) for number in range(min(self.settings.validation_trajectories, len(self.valid_data)))]
+        self.model.train()
         try:
             with self._signals(), self._bar():
                 self._loop()
@@ -311,11 +347,9 @@ class Trainer:
         state, frames = self.progress_state, self.model.window(progress)
         windows = self.sampler.next(frames).to(self.device)
         rate = self.settings.rate(self.step, progress)
-        for group in self.optimizer.param_groups:
-            group["lr"] = rate
-        self.model.train()
         loss = self.model.loss(windows, self.generator, progress)
-        self.optimizer.zero_grad(set_to_none=True)
+        for parameter in self.parameters:
+            parameter.grad = None
         loss.backward()
         norm = torch.nn.utils.clip_grad_norm_(self.parameters, self.settings.gradient_clip or math.inf)
         loss_value, norm_value = float(loss.detach()), float(norm)
@@ -325,7 +359,7 @@ class Trainer:
                 f"{self.folder}: step {self.step}: loss = {loss_value}, gradient norm = {norm_value}: training diverged; {kept}; "
                 f"start again with a smaller training.learning_rate (now {self.settings.learning_rate:g})"
             )
-        self.optimizer.step()
+        self.optimizer.step(rate)
         self._update_average()
         state["step"] += 1
         state["loss_sum"] += loss_value
@@ -414,7 +448,7 @@ class Trainer:
         self.progress_state["seconds"] = self.seconds()
         state = {
             "config": self._config_dict(), "spec": json.loads(json.dumps(self.spec.to_dict())), "model": self.model.state_dict(),
-            "average": self.average, "optimizer": self.optimizer.state_dict(), "sampler": self.sampler.state(),
+            "average": self.average, "optimizer": self.optimizer.state(), "sampler": self.sampler.state(),
             "generator": self.generator.get_state(), "torch_random": torch.get_rng_state(),
             "device_random": torch.cuda.get_rng_state_all() if self.device.type == "cuda" else [], "progress": dict(self.progress_state),
         }

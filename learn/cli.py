@@ -1,0 +1,103 @@
+"""``sluice-learn``: train a model, roll one out, look into a checkpoint.
+
+Exit codes: 0 done; 1 failed while running (training diverged or was stopped; resume by the same command); 2 bad input, nothing written.
+torch is imported by the commands, not here, so that ``--help`` is quick.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+
+from sim.errors import InputError, RunError
+
+
+def _train(arguments: argparse.Namespace) -> None:
+    from learn.train import load_config, train
+
+    names = ("seed", "device", "threads", "minutes", "steps")
+    overrides = {name: getattr(arguments, name) for name in names if getattr(arguments, name) is not None}
+    config = load_config(arguments.config, overrides)
+    print(json.dumps(train(config, arguments.data, arguments.out, arguments.config), indent=1, sort_keys=True))
+
+
+def _rollout(arguments: argparse.Namespace) -> None:
+    from learn.rollout import rollout_dataset
+    from learn.train import resolve_device
+
+    cost = rollout_dataset(
+        arguments.checkpoint, arguments.data, arguments.split, arguments.out, count=arguments.count, frames=arguments.frames,
+        device=resolve_device(arguments.device, "command line"), threads=arguments.threads,
+    )
+    frames = sum(entry["frames"] for entry in cost["trajectories"].values())
+    print(f"{arguments.out}: {len(cost['trajectories'])} rollouts, {frames} frames, {cost['wall_seconds']:.2f} s")
+
+
+def _info(arguments: argparse.Namespace) -> None:
+    from learn.checkpoint import file_hash, load_model, read_model_file
+
+    content, model = read_model_file(arguments.checkpoint), load_model(arguments.checkpoint)
+    shown = {name: content[name] for name in ("model", "settings", "spec", "provenance")}
+    shown["parameters"] = sum(parameter.numel() for parameter in model.parameters())
+    shown["sha256"] = file_hash(arguments.checkpoint)
+    print(json.dumps(shown, indent=1, sort_keys=True))
+
+
+def _positive(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise ValueError
+    return value
+
+
+_positive.__name__ = "integer >= 1"  # what argparse names in its message
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line of ``sluice-learn``."""
+    top = argparse.ArgumentParser(prog="sluice-learn", description="Train learned particle simulators and roll them out.")
+    commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
+
+    train = commands.add_parser("train", help="train a model, or resume the run in --out", description="Train a model, or resume the run in --out.")
+    train.add_argument("config", metavar="CONFIG", help="a file of configs/models/")
+    train.add_argument("--data", required=True, metavar="DIR", help="data set with the splits train and valid")
+    train.add_argument("--out", required=True, metavar="RUN", help="run folder")
+    train.add_argument("--seed", type=int, help="instead of training.seed")
+    train.add_argument("--device", choices=("auto", "cpu", "cuda"), help="instead of training.device")
+    train.add_argument("--threads", type=int, help="instead of training.threads")
+    budget = train.add_mutually_exclusive_group()
+    budget.add_argument("--minutes", type=float, help="budget in minutes, instead of the configuration's")
+    budget.add_argument("--steps", type=int, help="budget in steps, instead of the configuration's")
+    train.set_defaults(act=_train)
+
+    text = "Roll a checkpoint out over the trajectories of a data set, into a trajectory file like the solver's."
+    rollout = commands.add_parser("rollout", help="roll a checkpoint out over a data set", description=text)
+    rollout.add_argument("checkpoint", metavar="CHECKPOINT", help="a best.pt")
+    rollout.add_argument("--data", required=True, metavar="DIR", help="data set")
+    rollout.add_argument("--split", default="test", help="default: %(default)s")
+    rollout.add_argument("--count", type=_positive, help="trajectories, default: all of the split")
+    rollout.add_argument("--frames", type=_positive, help="predicted frames, default: to the end of the true trajectory")
+    rollout.add_argument("--out", required=True, metavar="FILE", help="shard to write; run times go to FILE.cost.json")
+    rollout.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="default: %(default)s")
+    rollout.add_argument("--threads", type=_positive, default=1, help="CPU threads, default: %(default)s")
+    rollout.set_defaults(act=_rollout)
+
+    info = commands.add_parser("info", help="what a checkpoint holds, as JSON", description="What a checkpoint holds, as JSON.")
+    info.add_argument("checkpoint", metavar="CHECKPOINT", help="a best.pt")
+    info.set_defaults(act=_info)
+    return top
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run a command; returns its exit code."""
+    parsed = parser().parse_args(arguments)
+    try:
+        parsed.act(parsed)
+    except InputError as error:
+        print(f"sluice-learn: {error}", file=sys.stderr)
+        return 2
+    except (RunError, OSError) as error:
+        print(f"sluice-learn: {error}", file=sys.stderr)
+        return 1
+    return 0
