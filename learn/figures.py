@@ -1,0 +1,256 @@
+"""Figures of a comparison and of a training, from rows and CSV files alone. The suffix of the path (.svg, .png) chooses the format.
+
+One colour a kind in every figure, from Okabe & Ito's (2008) palette, which stays apart under the common colour-vision deficiencies; contenders
+of one kind differ in shade and dash.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+
+matplotlib.use("Agg")
+
+import matplotlib.pyplot as plt  # noqa: E402 - the backend must be chosen first
+from matplotlib.axes import Axes  # noqa: E402
+from matplotlib.colors import to_rgb  # noqa: E402
+from matplotlib.figure import Figure  # noqa: E402
+
+from learn.compare import Yardstick, pareto_front  # noqa: E402
+from sim.errors import InputError  # noqa: E402
+from sim.trajectory import atomic_path  # noqa: E402
+
+COLOURS = {
+    "reference": "#000000", "solver": "#0072B2", "learned": "#D55E00", "trivial": "#7A7A7A", "oracle": "#009E73", "floor": "#CC79A7",
+}
+MARKERS = {"reference": "*", "solver": "o", "learned": "s", "trivial": "X", "oracle": "D", "floor": "_"}
+KIND_NAMES = {
+    "reference": "reference", "solver": "solver ladder", "learned": "learned", "trivial": "trivial", "oracle": "oracle", "floor": "chaos floor",
+}
+_DASHES = ("-", (0, (5, 1.5)), (0, (1, 1.2)), (0, (4, 1.2, 1, 1.2)))
+_STYLE = {
+    "font.size": 10, "axes.titlesize": 11, "axes.spines.top": False, "axes.spines.right": False, "axes.grid": True, "grid.color": "#E4E4E4",
+    "grid.linewidth": 0.7, "axes.axisbelow": True, "figure.facecolor": "white", "savefig.facecolor": "white", "savefig.dpi": 150,
+    "svg.hashsalt": "sluice", "legend.frameon": False, "legend.fontsize": 9,
+}
+
+
+def _save(figure: Figure, path: str | Path) -> None:
+    """Write atomically, without the date, so that equal rows give equal files."""
+    suffix = Path(path).suffix.lstrip(".")
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, format=suffix, metadata={"Date": None} if suffix == "svg" else None)
+    plt.close(figure)
+
+
+def _one_scene(rows: Sequence[dict]) -> str:
+    """The scene that all rows are about; ``ValueError`` for none or several, whose errors share no axis."""
+    scenes = sorted({row["scene"] for row in rows})
+    if len(scenes) != 1:
+        raise ValueError(f"rows = {scenes}: a figure shows one scene")
+    return scenes[0]
+
+
+def _shades(rows: Sequence[dict]) -> list[tuple[tuple[float, float, float], object]]:
+    """(colour, dash) of every row: the colour of its kind, lightened and dashed along the contenders of that kind."""
+    result = []
+    for row in rows:
+        kin = [other["contender"] for other in rows if other["kind"] == row["kind"]]
+        rank = kin.index(row["contender"])
+        light = 0.55 * rank / max(len(kin) - 1, 1)
+        colour = tuple(light + (1 - light) * channel for channel in to_rgb(COLOURS[row["kind"]]))
+        result.append((colour, _DASHES[rank % len(_DASHES)]))
+    return result
+
+
+def _place_labels(axes: Axes, points: Sequence[tuple[float, float]], labels: Sequence[str], colours: Sequence) -> None:
+    """Write each label at the nearest free place around its point: off the other labels, off all points, inside the axes."""
+    figure = axes.figure
+    figure.canvas.draw()
+    renderer, frame = figure.canvas.get_renderer(), axes.get_window_extent()
+    pixels = axes.transData.transform(points)
+    size = figure.dpi / 72
+    taken = [matplotlib.transforms.Bbox.from_bounds(x - 6 * size, y - 6 * size, 12 * size, 12 * size) for x, y in pixels]
+    # The crowded points choose first.
+    crowd = [sum(math.exp(-math.dist(one, other) / (40 * size)) for other in pixels) for one in pixels]
+    for index in sorted(range(len(labels)), key=lambda index: -crowd[index]):
+        text = axes.annotate(labels[index], points[index], textcoords="offset points", xytext=(0, 0), fontsize=8.5, color=colours[index])
+        extent = text.get_window_extent(renderer)
+        wide, high = extent.width, extent.height
+        best, least = (0.0, 0.0), math.inf
+        for radius in (9, 14, 20, 28, 38, 50, 64, 80):
+            for angle in np.radians((0, 180, 35, -35, 145, -145, 90, -90, 65, -65, 115, -115)):
+                reach_x, reach_y = radius * size * math.cos(angle), radius * size * math.sin(angle)
+                left = pixels[index][0] + reach_x - (0 if math.cos(angle) > 0.2 else wide if math.cos(angle) < -0.2 else wide / 2)
+                low = pixels[index][1] + reach_y - high / 2
+                box = matplotlib.transforms.Bbox.from_bounds(left, low, wide, high)
+                clash = sum(
+                    max(0, min(box.x1, other.x1) - max(box.x0, other.x0)) * max(0, min(box.y1, other.y1) - max(box.y0, other.y0)) for other in taken
+                )
+                inside = box.x0 >= frame.x0 and box.x1 <= frame.x1 and box.y0 >= frame.y0 and box.y1 <= frame.y1
+                cost = clash + (0 if inside else 1e6)
+                if cost < least:
+                    least, best, chosen, far = cost, (left, low), box, radius > 20
+            if least == 0:
+                break
+        taken.append(chosen)
+        text.remove()
+        spot = ((best[0] - pixels[index][0]) / size, (best[1] - pixels[index][1]) / size)
+        axes.annotate(
+            labels[index], points[index], textcoords="offset points", xytext=spot, fontsize=8.5, color=colours[index], annotation_clip=False,
+            arrowprops={"arrowstyle": "-", "color": "#9A9A9A", "lw": 0.6, "shrinkA": 0, "shrinkB": 4} if far else None,
+        )
+
+
+def error_over_run_time(rows: Sequence[dict], path: str | Path, yardstick: Yardstick = Yardstick()) -> None:
+    """Error over seconds per frame, log-log, one point a contender, whiskers from least to most over trajectories and timings.
+
+    The front of solver and learned contenders is a line, the chaos floor a band below which errors mean nothing. An error of zero (the
+    reference) has no place on a log axis: it sits on the lower edge. Contenders without error or time are listed under the axes.
+    """
+    scene = _one_scene(rows)
+    shown = [row for row in rows if row["kind"] not in ("floor", "oracle")]
+    drawn = [row for row in shown if yardstick.of(row) is not None and row["seconds_per_frame"]]
+    left_out = [f"{row['contender']} ({row['status']})" for row in shown if not any(row is other for other in drawn)]
+    floors = [yardstick.of(row) for row in rows if row["kind"] == "floor" and yardstick.of(row)]
+    positive = [yardstick.of(row) for row in drawn if yardstick.of(row) > 0] + floors
+    low = 10 ** (math.floor(math.log10(min(positive))) - 1) if positive else 1e-9
+    with plt.rc_context(_STYLE):
+        figure, axes = plt.subplots(figsize=(8.5, 5.6), layout="constrained")
+        axes.set(xscale="log", yscale="log", xlabel="run time, seconds per frame", ylabel=str(yardstick), title=f"{scene}: error over run time")
+        points = [(row["seconds_per_frame"], max(yardstick.of(row), low)) for row in drawn]
+        for row, (x, y) in zip(drawn, points, strict=True):
+            colour = COLOURS[row["kind"]]
+            worst, least = ({"of": yardstick.of(row["spread"][end])}["of"] for end in ("max", "min"))
+            if y > low and worst is not None and least:
+                axes.plot([x, x], [max(least, low), worst], color=colour, lw=1, alpha=0.45, zorder=2)
+            if row.get("timing_spread"):
+                axes.plot(row["timing_spread"]["seconds_per_frame"], [y, y], color=colour, lw=1, alpha=0.45, zorder=2)
+            hollow = {"markerfacecolor": "white"} if row["failures"] else {}
+            axes.plot(x, y, MARKERS[row["kind"]], color=colour, markersize=13 if row["kind"] == "reference" else 8, zorder=4, clip_on=False, **hollow)
+        front = [(row["seconds_per_frame"], max(yardstick.of(row), low)) for row in pareto_front(list(rows), yardstick)]
+        if len(front) > 1:
+            axes.plot(*zip(*front, strict=True), color="#444444", lw=1.2, ls=(0, (4, 2)), zorder=1)
+        if floors:
+            axes.axhspan(low, floors[0], color=COLOURS["floor"], alpha=0.18, lw=0, zorder=0)
+        if points:
+            times, errors = np.array(points).T
+            axes.set_xlim(times.min() / 3, times.max() * 3)
+            axes.set_ylim(low, max(errors.max(), *(floors or [low])) * 4)
+        kinds = [kind for kind in COLOURS if any(row["kind"] == kind for row in drawn)]
+        handles = [
+            plt.Line2D([], [], color=COLOURS[kind], marker=MARKERS[kind], ls="", markersize=11 if kind == "reference" else 7, label=KIND_NAMES[kind])
+            for kind in kinds
+        ]
+        if any(row["failures"] for row in drawn):
+            handles.append(plt.Line2D([], [], color="#444444", marker="o", markerfacecolor="white", ls="", label="some rollouts failed"))
+        if len(front) > 1:
+            handles.append(plt.Line2D([], [], color="#444444", lw=1.2, ls=(0, (4, 2)), label="Pareto front"))
+        if floors:
+            handles.append(plt.Rectangle((0, 0), 1, 1, color=COLOURS["floor"], alpha=0.3, lw=0, label=KIND_NAMES["floor"]))
+        figure.legend(handles=handles, loc="outside upper center", ncols=4)
+        notes = []
+        if any(yardstick.of(row) == 0 for row in drawn):
+            notes.append("On the lower edge: error exactly zero.")
+        if left_out:
+            notes.append("Not drawn: " + "; ".join(left_out) + ".")
+        if notes:
+            figure.supxlabel("\n".join(notes), fontsize=8.5, color="#555555", wrap=True)
+        labels = [row["contender"] for row in drawn]
+        _place_labels(axes, points, labels, [COLOURS[row["kind"]] for row in drawn])
+        _save(figure, path)
+
+
+def _curve(row: dict, name: str, part: str) -> np.ndarray:
+    """[frames] of a row's curve with NaN for null."""
+    return np.array([math.nan if value is None else value for value in row["curves"][name][part]], float)
+
+
+def _time_axes(scene: str, label: str, title: str) -> tuple[Figure, Axes]:
+    figure, axes = plt.subplots(figsize=(9.5, 5.2), layout="constrained")
+    axes.set(xlabel="time after the known frames, s", ylabel=label, title=f"{scene}: {title}")
+    return figure, axes
+
+
+def error_over_time(rows: Sequence[dict], path: str | Path) -> None:
+    """Mean squared distance per axis of the moving particles in each frame, log scale: median and min-max band over trajectories.
+
+    The chaos floor, the error of the solver against itself, is a line of its own; contenders without any error (reference, oracle) are left out.
+    """
+    scene = _one_scene(rows)
+    with plt.rc_context(_STYLE):
+        figure, axes = _time_axes(scene, "MSE of moving particles in the frame, length²", "error over time (median; band: least to most)")
+        axes.set_yscale("log")
+        for row, (colour, dash) in zip(rows, _shades(rows), strict=True):
+            time = np.array(row["curves"]["frame"]) * row["frame_step"]
+            median, least, most = (_curve(row, "mse", part) for part in ("median", "min", "max"))
+            if not (median > 0).any():
+                continue
+            # A log axis has no zero: frames without error are gaps.
+            median, least = np.where(median > 0, median, np.nan), np.where(least > 0, least, np.nan)
+            if row["kind"] in ("learned", "floor"):
+                axes.fill_between(time, least, most, color=colour, alpha=0.15, lw=0)
+            axes.plot(time, median, color=colour, ls=dash, lw=2 if row["kind"] in ("learned", "floor") else 1.3, label=row["contender"])
+        figure.legend(loc="outside right center")
+        _save(figure, path)
+
+
+def kinetic_energy(rows: Sequence[dict], path: str | Path) -> None:
+    """Kinetic energy per unit mass over time, median over trajectories: the truth in black under the contenders; floor and oracle left out."""
+    scene = _one_scene(rows)
+    shown = [row for row in rows if row["kind"] not in ("floor", "oracle", "reference")]
+    with plt.rc_context(_STYLE):
+        figure, axes = _time_axes(scene, "kinetic energy per unit mass, length²/s²", "kinetic energy (median)")
+        time = np.array(rows[0]["curves"]["frame"]) * rows[0]["frame_step"]
+        truth = _curve(rows[0], "kinetic_energy_true", "median")
+        axes.plot(time, truth, color=COLOURS["reference"], lw=2.6, label=f"truth ({rows[0]['reference']})")
+        for row, (colour, dash) in zip(shown, _shades(shown), strict=True):
+            axes.plot(time, _curve(row, "kinetic_energy", "median"), color=colour, ls=dash, lw=2 if row["kind"] == "learned" else 1.3, label=row["contender"])
+        # Falling for ever is not worth the scale: the truth keeps at least a third of the height.
+        axes.set_ylim(0, 3 * float(np.nanmax(truth)) if np.nanmax(truth) > 0 else None)
+        figure.legend(loc="outside right center")
+        _save(figure, path)
+
+
+def _read_columns(path: Path, columns: Sequence[str]) -> dict[str, np.ndarray]:
+    """Columns of a CSV file as float arrays; ``InputError`` where the file, a column or a number is missing."""
+    try:
+        with path.open(newline="") as file:
+            lines = list(csv.DictReader(file))
+        return {column: np.array([float(line[column]) for line in lines]) for column in columns}
+    except (OSError, KeyError, TypeError, ValueError) as error:
+        raise InputError(path, "columns", list(columns), f"not readable as a training log ({error}); train again or correct the path") from None
+
+
+def _smooth(values: np.ndarray, count: int) -> np.ndarray:
+    """Centred running median over ``count`` entries, shorter at the ends."""
+    return np.array([np.median(values[max(0, i - count // 2) : i + count // 2 + 1]) for i in range(len(values))])
+
+
+def training_curve(runs: dict[str, str | Path], path: str | Path) -> None:
+    """Training loss (running median over the raw values) and validation rollout MSE over training time, one colour a run.
+
+    runs: label -> run folder with ``log.csv`` (step, seconds, loss) and ``validation.csv`` (step, seconds, rollout_mse). ``InputError``
+    for a file that cannot be read.
+    """
+    palette = [COLOURS[kind] for kind in ("learned", "solver", "oracle", "floor", "reference")]
+    with plt.rc_context(_STYLE):
+        figure, (above, below) = plt.subplots(2, 1, figsize=(8.5, 6), sharex=True, layout="constrained")
+        for index, (label, folder) in enumerate(runs.items()):
+            colour, dash = palette[index % len(palette)], _DASHES[index // len(palette) % len(_DASHES)]
+            log = _read_columns(Path(folder) / "log.csv", ("step", "seconds", "loss"))
+            validation = _read_columns(Path(folder) / "validation.csv", ("step", "seconds", "rollout_mse"))
+            steps = int(log["step"][-1]) if len(log["step"]) else 0
+            above.plot(log["seconds"] / 60, log["loss"], color=colour, lw=0.6, alpha=0.3)
+            above.plot(log["seconds"] / 60, _smooth(log["loss"], max(len(log["loss"]) // 30, 1)), color=colour, ls=dash, lw=1.8,
+                       label=f"{label} ({steps:,} steps)")
+            below.plot(validation["seconds"] / 60, validation["rollout_mse"], color=colour, ls=dash, lw=1.6, marker="o", markersize=4)
+        above.set(yscale="log", ylabel="training loss", title="training")
+        below.set(yscale="log", ylabel="validation rollout MSE, length²", xlabel="training time, minutes")
+        figure.legend(loc="outside upper center", ncols=3)
+        _save(figure, path)
