@@ -37,8 +37,9 @@ def validate(kind: type[Checked], content: object, where: object, key: str) -> C
         value, message = fault["input"], fault["msg"]
         if fault["type"] == "extra_forbidden":
             message = f"unknown key; the keys are {', '.join(sorted(kind.model_fields))}" if len(fault["loc"]) == 1 else "unknown key; remove it"
-        # A container is named, not shown: YAML aliases can make its text as long as they like.
-        raise InputError(where, path, value if isinstance(value, (str, int, float, type(None))) else type(value).__name__, message) from None
+        # Of a container only the keys are shown: YAML aliases can make its text as long as they like.
+        shown = list(value) if isinstance(value, dict) else value if isinstance(value, (str, int, float, type(None))) else type(value).__name__
+        raise InputError(where, path, shown, message.removeprefix("Value error, ")) from None
 
 
 def _write(path: str | Path, content: dict) -> None:

@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
@@ -162,6 +164,17 @@ class _Moments:
         return np.sqrt(np.maximum(self.square / max(self.count, 1) - self.mean**2, 0))
 
 
+@contextmanager
+def _reading(reader: ShardReader, key: str) -> Iterator[None]:
+    """What h5py raises on damaged metadata is open-ended (KeyError, RuntimeError, ...); all of it is a damaged shard."""
+    try:
+        yield
+    except InputError:
+        raise
+    except (OSError, RuntimeError, LookupError, ValueError, TypeError, AttributeError, MemoryError) as error:
+        raise InputError(reader.path, key, str(error), "damaged file; delete the shard and generate again") from None
+
+
 class Dataset:
     """One split of a data set folder (see ``docs/architecture.md``). Every fault of the files is an ``InputError``.
 
@@ -181,7 +194,8 @@ class Dataset:
         entries = []
         for shard in shards:
             reader = ShardReader(self.folder / shard)
-            entries += [(index, reader) for index in reader.indices() if reader.meta(index)["status"] == "ok"]
+            with _reading(reader, "groups"):
+                entries += [(index, reader) for index in reader.indices() if reader.meta(index)["status"] == "ok"]
         entries.sort(key=lambda entry: entry[0])
         if not entries:
             raise InputError(self.path, f"splits.{split}", "no usable trajectory", "generate some")
@@ -192,13 +206,14 @@ class Dataset:
         self._positions: dict[int, np.ndarray] = {}
         self._types: dict[int, np.ndarray] = {}
         self._contexts: dict[int, np.ndarray | None] = {}
+        self._speeds: dict[int, np.ndarray] = {}
 
     def _read_content(self) -> dict:
         if not self.path.is_file():
             raise InputError(self.path, "file", str(self.path), "no such data set; generate it (sluice-sim generate) or correct the path")
         try:
             content = json.loads(self.path.read_text())
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:
             raise InputError(self.path, "file", str(error), "not JSON; generate the data set again") from None
         version = content.get("format_version") if isinstance(content, dict) else None
         if version != 1:
@@ -232,13 +247,15 @@ class Dataset:
     def trajectory(self, number: int) -> Trajectory:
         """The whole trajectory ``number``."""
         index, reader = self.entries[number]
-        return reader.read(index)
+        with _reading(reader, f"{index:06d}"):
+            return reader.read(index)
 
     def particle_type(self, number: int) -> np.ndarray:
         """[particles] int64 of trajectory ``number``."""
         if number not in self._types:
             index, reader = self.entries[number]
-            kinds = reader.particle_type(index).astype(np.int64)
+            with _reading(reader, f"{index:06d}/particle_type"):
+                kinds = reader.particle_type(index).astype(np.int64)
             if kinds.size == 0 or kinds.min() < 0 or kinds.max() >= TYPE_SLOTS:
                 found = sorted(set(kinds.tolist()))
                 raise InputError(reader.path, f"{index:06d}/particle_type", found, f"must be ids in 0..{TYPE_SLOTS - 1}, one particle at least")
@@ -249,7 +266,8 @@ class Dataset:
         """[frames, c] float32 of trajectory ``number``, or None."""
         if number not in self._contexts:
             index, reader = self.entries[number]
-            context = reader.context(index)
+            with _reading(reader, f"{index:06d}/context"):
+                context = reader.context(index)
             if context is not None and (context.ndim != 2 or len(context) != self.shapes[number][0] or not np.isfinite(context).all()):
                 raise InputError(reader.path, f"{index:06d}/context", context.shape, "must be finite, [frames, c]; generate the shard again")
             self._contexts[number] = context
@@ -260,7 +278,8 @@ class Dataset:
         index, reader = self.entries[number]
         if number in self._positions:
             return self._positions[number][start:stop:step]
-        block = reader.positions(index) if self._keep else reader.positions(index, start, stop, step)
+        with _reading(reader, f"{index:06d}/position"):
+            block = reader.positions(index) if self._keep else reader.positions(index, start, stop, step)
         if not np.isfinite(block).all():
             raise InputError(reader.path, f"{index:06d}/position", "non-finite", "damaged data; delete the shard and generate again")
         if self._keep:
@@ -357,10 +376,10 @@ class Dataset:
 
     def _speed(self, number: int) -> np.ndarray:
         """[frames - 1]: largest displacement of a moving particle from one file frame to the next."""
-        position = self.positions(number)[:, self.particle_type(number) != KINEMATIC_TYPE]
-        if position.shape[1] == 0:
-            return np.zeros(len(position) - 1)
-        return np.sqrt(((position[1:] - position[:-1]) ** 2).sum(2).max(1))
+        if number not in self._speeds:
+            position = self.positions(number)[:, self.particle_type(number) != KINEMATIC_TYPE]
+            self._speeds[number] = np.sqrt(((position[1:] - position[:-1]) ** 2).sum(2).max(1, initial=0))
+        return self._speeds[number]
 
     def batch(self, rows: np.ndarray, frames: int, stride: int = 1, mirror: np.ndarray | None = None) -> Windows:
         """The windows ``rows`` [examples, 2] (as ``windows`` returns them) as one ``Windows``.

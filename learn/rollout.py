@@ -71,7 +71,7 @@ def rollout_dataset(
 
 def check_fit(model: nn.Module, dataset: Dataset, checkpoint: object) -> None:
     """A model predicts in frames of its training data and knows their types only: ``InputError`` where the data set differs."""
-    for name in ("dim", "frame_step", "radius"):
+    for name in ("dim", "frame_step"):
         own, given = getattr(model.spec, name), dataset.common[name]
         if own != given:
             raise InputError(dataset.path, name, given, f"{checkpoint} was trained with {own}; use data of the same {name}")

@@ -4,8 +4,8 @@ A run folder holds ``checkpoint.pt`` (all that resuming needs), ``best.pt`` (the
 that inference needs), ``log.csv``, ``validation.csv`` and, at the end, ``done.json``. With a budget in steps, on a CPU with one thread, a
 run that is killed at any instant and started again ends bitwise where the unbroken run ends.
 
-Decision: a budget in minutes counts everything from the first step's preparation on, validation included, because that is what a user
-waits for; only the last validation may exceed it. Progress is then elapsed / budget, so such a run is resumed, but not bitwise.
+Decision: a budget in minutes counts everything from the reading of the data on, validation included, because that is what a user waits
+for; only the last validation may exceed it. Progress is then elapsed / budget, so such a run is resumed, but not bitwise.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from torch import Tensor, nn
 from torch.optim.adam import adam
 from tqdm import tqdm
 
-from learn.checkpoint import STATE_KEYS, build_model, load_state, save_model, save_state, validate
+from learn.checkpoint import STATE_KEYS, build_model, load_state, load_weights, save_model, save_state, validate
 from learn.dataset import Dataset, DataSettings, Sampler
 from learn.metrics import frame_mse, spacing_ratio
 from sim import __version__
@@ -212,6 +212,8 @@ class Trainer:
     def __init__(self, config: Config, data: str | Path, run: str | Path, where: object = "config"):
         self.config, self.settings, self.folder, self.where = config, config.training, Path(run), where
         self.started = time.perf_counter()
+        if self.folder.exists() and not self.folder.is_dir():
+            raise InputError(self.folder, "--out", str(self.folder), "is not a folder; give another name")
         self.device = resolve_device(self.settings.device, where)
         torch.set_num_threads(self.settings.threads)
         self.train_data, self.valid_data = Dataset(data, "train"), Dataset(data, "valid")
@@ -255,10 +257,10 @@ class Trainer:
                 key = _first_difference(state[name], own)
                 remedy = f"the run in this folder was started with another {name} ({key}); give another --out, or delete the folder"
                 raise InputError(path, f"{name}.{key}", _at(own, key), remedy)
+        load_weights(self.model, state["average"], path)
+        self.average = {name: value.detach().clone() for name, value in self.model.state_dict().items()}
+        load_weights(self.model, state["model"], path)
         try:
-            self.model.load_state_dict(state["model"])
-            for name, value in self.average.items():
-                value.copy_(state["average"][name])
             self.optimizer.restore(state["optimizer"])
             self.sampler.restore(state["sampler"])
             self.generator.set_state(state["generator"])
@@ -266,9 +268,11 @@ class Trainer:
             if self.device.type == "cuda" and state["device_random"]:
                 torch.cuda.set_rng_state_all(state["device_random"])
             self.progress_state = {name: state["progress"][name] for name in self.progress_state}
-        except (KeyError, ValueError, RuntimeError, TypeError, IndexError) as error:
-            if isinstance(error, InputError):
-                raise
+            if not all(value is None or isinstance(value, (int, float)) for value in self.progress_state.values()):
+                raise ValueError("progress must hold numbers")
+        except InputError:
+            raise
+        except (KeyError, ValueError, RuntimeError, TypeError, IndexError, AttributeError) as error:
             raise InputError(path, "file", str(error), "damaged training state; delete the run folder and train again") from None
 
     def _config_dict(self) -> dict:
@@ -299,6 +303,8 @@ class Trainer:
         if done.is_file() and self.step > 0 and self._finished_before(done):
             return json.loads(done.read_text())
         self.folder.mkdir(parents=True, exist_ok=True)
+        for abandoned in self.folder.glob(".*.pt.*.tmp.pt"):  # what a kill in the middle of writing left
+            abandoned.unlink()
         self.log = _Table(self.folder / "log.csv", LOG_COLUMNS, self.step)
         self.validation = _Table(self.folder / "validation.csv", VALIDATION_COLUMNS, self.progress_state["validated_step"])
         self._saved_at, self._printed_at = time.perf_counter(), -math.inf
