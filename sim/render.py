@@ -225,7 +225,7 @@ class _GLPainter:
         self.mesh.point_data["rgb"] = np.zeros((particles, 3), np.uint8)
         self.plotter.add_points(
             self.mesh, scalars="rgb", rgb=True, render_points_as_spheres=True, point_size=max(size, 1.5) * oversample,
-            ambient=0.45, diffuse=0.6, specular=0.05, reset_camera=False,
+            ambient=0.55, diffuse=0.5, specular=0.03, reset_camera=False,
         )  # fmt: skip
         self.plotter.add_lines(view.edges().reshape(-1, 3), color=np.array(BOX) / 255, width=1.2 * oversample)
         camera = self.plotter.camera
@@ -271,7 +271,8 @@ class _MatplotlibPainter:
         lines = [view.project(edge[:, : view.dim])[0] for edge in view.edges()]
         axes.add_collection(LineCollection(lines, colors=[np.array(BOX) / 255], linewidths=0.9))
         size = max(size, 1.5)
-        self.discs = axes.add_collection(EllipseCollection([size], [size], [0], units="xy", offsets=np.empty((0, 2)), offset_transform=axes.transData, linewidths=0))
+        discs = EllipseCollection([size], [size], [0], units="xy", offsets=np.empty((0, 2)), offset_transform=axes.transData, linewidths=0)
+        self.discs = axes.add_collection(discs)
 
     def paint(self, points: np.ndarray, rgb: np.ndarray) -> np.ndarray:
         """As ``_GLPainter.paint``."""
@@ -313,7 +314,8 @@ class _Sheet:
         from matplotlib import get_data_path
         from PIL import Image, ImageDraw, ImageFont
 
-        unit = view.width / PANE_WIDTH
+        unit = max(view.width / PANE_WIDTH, 0.75)  # the small panes of a strip keep readable text
+        inset = round(MARGIN * view.width)  # text begins where the box begins
         face = str(Path(get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf")
         title_font, self.font = (ImageFont.truetype(face, max(9, round(points * unit))) for points in (19, 15))
         gap, title, bar = (round(pixels * unit) for pixels in (16, 32, 34))
@@ -326,18 +328,18 @@ class _Sheet:
         for row, line in enumerate(lines):
             for column, pane in enumerate(line):
                 x = gap + column * (view.width + gap)
-                marks.append((x, y, pane.title))
+                marks.append((x + inset, y, pane.title))
                 self.corners.append((x, y + title))
             y += title + view.height
             if not one_scale or row == rows - 1:
                 y += bar
-        self.footer_at = (gap, y)
+        self.footer_at = (gap + inset, y)
         y += bar if footer else gap // 2
         self.size = (width + width % 2, y + y % 2)  # yuv420p wants even sizes
         self.ground = Image.new("RGB", self.size, "white")
         draw = ImageDraw.Draw(self.ground)
         for x, top, text in marks:
-            draw.text((x + 2 * unit, top + title / 2), text, INK, title_font, anchor="lm")
+            draw.text((x, top + title / 2), text, INK, title_font, anchor="lm")
         for row, line in enumerate(lines):
             if one_scale and row < rows - 1:
                 continue
@@ -385,7 +387,8 @@ class _Sheet:
 
 
 def _pictures(
-    panes: Sequence[Pane], bounds: np.ndarray, spacing: float, footers: Sequence[str], columns: int | None, width: int, gravity: Sequence[float] | None, oversample: int
+    panes: Sequence[Pane], bounds: np.ndarray, spacing: float, footers: Sequence[str], columns: int | None, width: int,
+    gravity: Sequence[float] | None, oversample: int,
 ) -> tuple[tuple[int, int], Iterable[np.ndarray]]:
     """(width, height) and the pictures, drawn one by one as they are asked for."""
     view = View(bounds, width, gravity)
@@ -406,7 +409,8 @@ def _pictures(
 
 def render_film(
     path: str | Path, panes: Sequence[Pane], bounds: np.ndarray, spacing: float, *,
-    footers: Sequence[str] | None = None, columns: int | None = None, width: int = PANE_WIDTH, gravity: Sequence[float] | None = None, rate: float = FILM_RATE,
+    footers: Sequence[str] | None = None, columns: int | None = None, width: int = PANE_WIDTH, gravity: Sequence[float] | None = None,
+    rate: float = FILM_RATE,
 ) -> None:  # fmt: skip
     """Write an H.264 film (yuv420p, even size: plays in browsers) of the panes side by side, complete or not at all.
 
@@ -421,15 +425,16 @@ def render_film(
     with atomic_path(path) as temporary:
         writer = imageio_ffmpeg.write_frames(
             str(temporary), size, fps=rate, codec="libx264", pix_fmt_out="yuv420p", macro_block_size=2, quality=None,
-            ffmpeg_log_level="error", output_params=["-crf", "23", "-preset", "medium", "-movflags", "+faststart"],
+            ffmpeg_log_level="error", output_params=["-crf", "23", "-preset", "veryfast", "-movflags", "+faststart"],
         )  # fmt: skip
         try:
             writer.send(None)
             for picture in pictures:
                 writer.send(np.ascontiguousarray(picture))
-            writer.close()
         except OSError as error:
             raise RunError(f"{path}: ffmpeg could not write the film: {str(error).splitlines()[0]}") from None
+        finally:
+            writer.close()
 
 
 def render_still(
@@ -540,25 +545,30 @@ def render_strip(
 
 
 def comparison_panes(truth: Trajectory, prediction: np.ndarray, first: int, frames: np.ndarray, names: tuple[str, str]) -> list[Pane]:
-    """Three panes, solver | model | error, at ``frames`` (indices into ``prediction`` [frames, particles, dim], whose frame 0 is the truth's ``first``).
+    """Three panes, solver | model | error, at ``frames``: indices into ``prediction`` [frames, particles, dim], whose 0 is the truth's ``first``.
 
     Solver and model share one speed scale, taken from the solver; the error is each predicted particle's distance to its true
-    place, in particle spacings, with limits fixed over ``frames``.
+    place, in particle spacings. Limits are fixed over the whole prediction.
     """
-    true = truth.position[first : first + len(prediction)]
-    scale_of_speed = speed_scale(true_speed := speeds(true, frames, truth.frame_step, truth.moving))
-    error = np.linalg.norm(prediction[frames].astype(float) - true[frames], axis=2) / particle_spacing(truth)
-    error = np.where(truth.moving, error, np.nan)
+    true, step, spacing = truth.position[first : first + len(prediction)], truth.frame_step, particle_spacing(truth)
+
+    def error(chosen: np.ndarray) -> np.ndarray:
+        distance = np.linalg.norm(prediction[chosen].astype(float) - true[chosen], axis=2)
+        return np.where(truth.moving, distance / spacing, np.nan)
+
+    clip = film_frames(len(prediction))  # a still has the limits of its film
+    speed, distance = speed_scale(speeds(true, clip, step, truth.moving)), error_scale(error(clip))
     return [
-        Pane(names[0], true[frames], true_speed, scale_of_speed),
-        Pane(names[1], prediction[frames], speeds(prediction, frames, truth.frame_step, truth.moving), scale_of_speed),
-        Pane("error", prediction[frames], error, error_scale(error)),
+        Pane(names[0], true[frames], speeds(true, frames, step, truth.moving), speed),
+        Pane(names[1], prediction[frames], speeds(prediction, frames, step, truth.moving), speed),
+        Pane("error", prediction[frames], error(frames), distance),
     ]
 
 
 def render_comparison(
     path: str | Path, truth: Trajectory, prediction: np.ndarray, *,
-    first: int = 0, names: tuple[str, str] = ("solver", "model"), note: str = "", footer: Callable[[int], str] | None = None, time: float | None = None, width: int = PANE_WIDTH,
+    first: int = 0, names: tuple[str, str] = ("solver", "model"), note: str = "", footer: Callable[[int], str] | None = None,
+    time: float | None = None, width: int = PANE_WIDTH,
 ) -> None:  # fmt: skip
     """A film (``.mp4``) or still (``.png``) of solver | model | error.
 
