@@ -117,7 +117,7 @@ def _validate(options: argparse.Namespace) -> int:
         count += 1
         print(fault)
     if count:
-        print(f"{options.path}: {count} faults", file=sys.stderr)
+        print(f"{options.path}: {count} fault{'s' if count > 1 else ''}", file=sys.stderr)
         return 2
     print(f"{options.path}: sound")
     return 0

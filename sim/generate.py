@@ -182,7 +182,8 @@ def read_content(out: str | Path) -> dict:
     try:
         content = json.loads(path.read_text())
     except (OSError, ValueError) as error:
-        raise InputError(path, "file", getattr(error, "strerror", None) or "not JSON", "give the folder of a data set, or generate it again") from None
+        fault = getattr(error, "strerror", None) or "not JSON"
+        raise InputError(path, "file", fault, "give the folder of a data set, or generate it again") from None
     version = content.get("format_version") if isinstance(content, dict) else None
     if version != FORMAT_VERSION:
         raise InputError(path, "format_version", version, f"this version reads {FORMAT_VERSION}; generate the data set again")
@@ -414,7 +415,7 @@ def _work(connection: Connection, out: Path, teacher: Callable[[], Teacher]) -> 
         return
     except Exception as error:  # A fault of ours: the parent stops with one line, the traceback goes to the log.
         traceback.print_exc()
-        connection.send(("error", f"a worker process failed: {type(error).__name__}: {error}"))
+        connection.send(("error", f"a worker process failed: {type(error).__name__}: {' '.join(str(error).split())[:200]}"))
 
 
 def _end_with_parent() -> None:

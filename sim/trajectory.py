@@ -91,9 +91,12 @@ def write_json(path: str | Path, content: object) -> None:
 
 
 def write_shard(path: str | Path, trajectories: dict[int, Trajectory]) -> None:
-    """Write a shard atomically: ``{index: trajectory}``. The bytes depend on the trajectories alone."""
+    """Write a shard atomically: ``{index: trajectory}``. The bytes depend on the trajectories alone. Raises ``OSError``.
+
+    The file is built in memory: on a full disk HDF5 raises a bare RuntimeError, and may do so again when the file is closed.
+    """
     with atomic_path(path) as temporary:
-        with h5py.File(temporary, "w", libver=("v108", "v110")) as file:
+        with h5py.File(temporary.name, "w", driver="core", backing_store=False, libver=("v108", "v110")) as file:
             file.attrs["format_version"] = FORMAT_VERSION
             file.attrs["particle_types"] = json.dumps(PARTICLE_TYPES, sort_keys=True)
             for index in sorted(trajectories):
@@ -115,6 +118,9 @@ def write_shard(path: str | Path, trajectories: dict[int, Trajectory]) -> None:
                     "status": trajectory.status,
                 }
                 group.attrs["meta"] = json.dumps(meta, sort_keys=True)
+            file.flush()
+            image = file.id.get_file_image()
+        temporary.write_bytes(image)
 
 
 def _check(condition: bool, path: Path, key: str, value: object, remedy: str) -> None:
