@@ -122,8 +122,8 @@ class Level:
     """
 
     neighbours: Tensor
-    child: Tensor | None
-    coarse: int
+    child: Tensor | None = None
+    coarse: int = 0
 
 
 class SparseGrid(nn.Module):
@@ -135,7 +135,7 @@ class SparseGrid(nn.Module):
     def __init__(self, shape: list[int], levels: int):
         super().__init__()
         dim = len(shape)
-        self.dim, self.levels, self.sizes = dim, levels, []
+        self.dim, self.sizes = dim, []
         self.shape = list(shape)
         for level in range(levels):
             padded = torch.tensor(shape) + 2
@@ -158,25 +158,21 @@ class SparseGrid(nn.Module):
 
         Returns the occupied ids [A] ascending, their row by id [examples * sizes[0]], and the levels, finest first.
         """
-        ids, levels = nodes.reshape(-1), []
-        finest = rows = None
+        ids, corner, levels = nodes.reshape(-1), None, []
         for level, size in enumerate(self.sizes):
-            mask = torch.zeros(examples * size + 1, dtype=torch.bool, device=ids.device)
+            mask = torch.zeros(examples * size, dtype=torch.bool, device=ids.device)
             mask[ids] = True
             active = mask.nonzero().squeeze(1)
             lookup = torch.full((examples * size,), len(active), device=ids.device)
             lookup[active] = torch.arange(len(active), device=ids.device)
-            if level:
-                previous = levels[-1]
-                levels[-1] = Level(previous.neighbours, lookup[ids] * 2**self.dim + corner, len(active))
+            if levels:
+                levels[-1] = Level(levels[-1].neighbours, lookup[ids] * 2**self.dim + corner, len(active))
             else:
                 finest, rows = active, lookup
-            neighbours = lookup[active[:, None] + getattr(self, f"offset{level}")]
-            levels.append(Level(neighbours, None, 0))
-            if level + 1 < self.levels:
+            levels.append(Level(lookup[active[:, None] + getattr(self, f"offset{level}")]))
+            if level + 1 < len(self.sizes):
                 example, local = active // size, active % size
-                corner = getattr(self, f"corner{level}")[local]
-                ids = getattr(self, f"parent{level}")[local] + example * self.sizes[level + 1]
+                ids, corner = getattr(self, f"parent{level}")[local] + example * self.sizes[level + 1], getattr(self, f"corner{level}")[local]
         return finest, rows, levels
 
 
@@ -269,7 +265,7 @@ class GridEmulator(nn.Module):
         inside = ((fraction >= 0) & (fraction <= 1)).all(1)
         node = (base[:, None] + self.corners + 1) @ self.grid.stride0 + (example * self.grid.sizes[0])[:, None]
         weight = torch.where(self.corners.bool(), fraction[:, None], 1 - fraction[:, None]).prod(2)
-        return node, weight * inside[:, None]
+        return node, torch.where(inside[:, None], weight, 0)
 
     def to_grid(self, value: Tensor, row: Tensor, weight: Tensor, rows: int) -> Tensor:
         """Weighted sums [A, F] of particle values [N, F]: sum_p w_ip f_p."""
@@ -345,25 +341,25 @@ class GridEmulator(nn.Module):
         noise = random_walk_noise(windows.position[:history], self.options.noise * self.velocity_std, moving, generator)
         state = windows.position[:history] + noise
         target = windows.position[history:] + noise[-1]
-        total = state.new_zeros(())
-        calls = target.shape[0] // m
-        for call in range(calls):
-            context = None if windows.context is None else windows.context[history - 1 + call * m]
+        scale = self._scale(windows.position, moving)
+        errors = []
+        for first in range(0, len(target), m):
+            context = None if windows.context is None else windows.context[history - 1 + first]
             future = self.call(state, windows.particle_type, windows.example, windows.examples, context)
-            truth = target[call * m : (call + 1) * m]
+            truth = target[first : first + m]
             if self.fixed:
                 future = torch.where(moving[:, None], future, truth)
-            total = total + ((future - truth).square().mean(2) / self._scale(windows.position, call).square())[:, moving].mean()
+            errors.append((future - truth)[:, moving].square().mean((1, 2)))
             state = torch.cat([state, future])[-history:]
-        return total / calls
+        return (torch.cat(errors) / scale.square()).mean()
 
-    def _scale(self, position: Tensor, call: int) -> Tensor:
-        """[m, 1]: rms deviation of the true frames of a call from ballistic flight, floored."""
-        history, m = self.options.history, self.options.frames_per_call
-        now = history - 1 + call * m
-        velocity = position[now] - position[now - 1]
-        flight = position[now] + (velocity + self.gravity * (self.axis[:, None] + 1) / 2) * self.axis[:, None]
-        return (position[now + 1 : now + 1 + m] - flight).square().mean((1, 2)).sqrt().clamp(min=self.options.floor * self.spec.spacing)[:, None]
+    def _scale(self, position: Tensor, moving: Tensor) -> Tensor:
+        """[K m]: rms deviation of the window's frames after the history from ballistic flight, floored."""
+        now = self.options.history - 1
+        frame = torch.arange(1, len(position) - now, dtype=position.dtype, device=position.device)[:, None, None]
+        flight = position[now] + (position[now] - position[now - 1]) * frame + self.gravity * frame * (frame + 1) / 2
+        deviation = (position[now + 1 :] - flight)[:, moving].square().mean((1, 2)).sqrt()
+        return deviation.clamp(min=self.options.floor * self.spec.spacing)
 
     # ---- simulation -----------------------------------------------------------------------------------------------------------------
 
