@@ -116,12 +116,13 @@ def load_model(path: str | Path, device: torch.device | str = "cpu") -> nn.Modul
 
 
 def load_weights(model: nn.Module, weights: dict, where: object) -> None:
-    """Copy ``weights`` into ``model``; names, shapes and types must fit exactly and every number be finite."""
+    """Copy ``weights`` (on the CPU) into ``model``; names, shapes and types must fit exactly and every number be finite."""
     own = model.state_dict()
     if set(weights) != set(own):
         raise InputError(where, "state_dict", sorted(set(map(str, weights)) ^ set(own))[:5], "names of weights do not fit the model's settings")
     for name, value in weights.items():
-        fits = isinstance(value, torch.Tensor) and value.shape == own[name].shape and value.dtype == own[name].dtype
+        dense = isinstance(value, torch.Tensor) and value.layout == torch.strided and value.device.type == "cpu"
+        fits = dense and value.shape == own[name].shape and value.dtype == own[name].dtype
         if not fits or not bool(torch.isfinite(value).all()):
             shown = f"{value.dtype} {list(value.shape)}" if isinstance(value, torch.Tensor) else type(value).__name__
             raise InputError(where, f"state_dict.{name}", shown, f"must be finite, {own[name].dtype} {list(own[name].shape)}")

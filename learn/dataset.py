@@ -248,7 +248,14 @@ class Dataset:
         """The whole trajectory ``number``."""
         index, reader = self.entries[number]
         with _reading(reader, f"{index:06d}"):
-            return reader.read(index)
+            trajectory = reader.read(index)
+        self._check_finite(number, trajectory.position)
+        return trajectory
+
+    def _check_finite(self, number: int, block: np.ndarray) -> None:
+        if not np.isfinite(block).all():
+            index, reader = self.entries[number]
+            raise InputError(reader.path, f"{index:06d}/position", "non-finite", "damaged data; delete the shard and generate again")
 
     def particle_type(self, number: int) -> np.ndarray:
         """[particles] int64 of trajectory ``number``."""
@@ -280,8 +287,7 @@ class Dataset:
             return self._positions[number][start:stop:step]
         with _reading(reader, f"{index:06d}/position"):
             block = reader.positions(index) if self._keep else reader.positions(index, start, stop, step)
-        if not np.isfinite(block).all():
-            raise InputError(reader.path, f"{index:06d}/position", "non-finite", "damaged data; delete the shard and generate again")
+        self._check_finite(number, block)
         if self._keep:
             self._positions[number] = block
             return block[start:stop:step]

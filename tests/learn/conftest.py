@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 import json
+import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from learn.model import MODELS
 from sim.trajectory import Trajectory, write_shard
 
 torch.set_num_threads(1)
+
+#: The dummy model is found as a child process of the tests finds it: by its module's name, in this folder.
+sys.path.insert(0, str(Path(__file__).parent))
+MODELS["dummy"] = ("dummy_model", "Dummy")
 
 GRAVITY = (0.0, -9.81)
 FRAME_STEP = 0.01
@@ -41,7 +48,7 @@ def bounce(seed: int, particles: int = 24, frames: int = 40) -> Trajectory:
     )
 
 
-def write_dataset(folder: Path, splits: dict[str, dict[int, Trajectory]], per_shard: int = 2) -> Path:
+def _write_dataset(folder: Path, splits: dict[str, dict[int, Trajectory]], per_shard: int = 2) -> Path:
     """Write trajectories as a data set folder, ``per_shard`` in a shard, with the statistics of the training split."""
     content = {"format_version": 1, "scene": "bounce", "family": {}, "splits": {}}
     for split, trajectories in splits.items():
@@ -63,6 +70,12 @@ def write_dataset(folder: Path, splits: dict[str, dict[int, Trajectory]], per_sh
 
 
 @pytest.fixture(scope="session")
+def write_dataset() -> Callable[..., Path]:
+    """``write_dataset(folder, {split: {index: trajectory}})``."""
+    return _write_dataset
+
+
+@pytest.fixture(scope="session")
 def bounce_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A data set of 5 training, 2 validation and 3 test trajectories; not to be changed by a test."""
     splits = {
@@ -70,4 +83,4 @@ def bounce_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "valid": {index: bounce(100 + index) for index in range(2)},
         "test": {index: bounce(200 + index) for index in range(3)},
     }
-    return write_dataset(tmp_path_factory.mktemp("bounce"), splits)
+    return _write_dataset(tmp_path_factory.mktemp("bounce"), splits)

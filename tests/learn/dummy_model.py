@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import sys
-
 import torch
 from pydantic import BaseModel, ConfigDict, Field
 from torch import nn
-
-from learn import model
 
 
 class DummySettings(BaseModel):
@@ -52,10 +48,3 @@ class Dummy(nn.Module):
         nxt = self.state[1] + self.linear((self.state[1] - self.state[0]) / scale) * scale
         self.state = torch.stack([self.state[1], nxt])
         return nxt[None].numpy().copy()
-
-
-def register() -> None:
-    """Enter the dummy in the registry of models."""
-    model.MODELS["dummy"] = ("dummy_model", "Dummy")
-    sys.modules["dummy_model"] = sys.modules[__name__]
-    Dummy.__module__ = "dummy_model"
