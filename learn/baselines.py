@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
@@ -119,8 +120,9 @@ class RigidDrop(Baseline):
         super().begin(start)
         self.fall = start.gravity * start.frame_step**2
         moving = np.flatnonzero(~self.kinematic)
-        pairs = cKDTree(self.position[moving]).sparse_distance_matrix(cKDTree(self.position[moving]), start.radius)
-        count, label = connected_components(pairs, directed=False)
+        pairs = cKDTree(self.position[moving]).query_pairs(start.radius, output_type="ndarray")
+        graph = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(moving), len(moving)))
+        count, label = connected_components(graph, directed=False)
         self.bodies = [moving[label == body] for body in range(count)]
         self.body_velocity = np.array([self.velocity[body].mean(axis=0) for body in self.bodies])
         half = 0.5 * float(start.scene["spacing"])

@@ -9,6 +9,7 @@ from __future__ import annotations
 import csv
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 
 import matplotlib
@@ -20,8 +21,9 @@ import matplotlib.pyplot as plt  # noqa: E402 - the backend must be chosen first
 from matplotlib.axes import Axes  # noqa: E402
 from matplotlib.colors import to_rgb  # noqa: E402
 from matplotlib.figure import Figure  # noqa: E402
+from matplotlib.transforms import Bbox  # noqa: E402
 
-from learn.compare import Yardstick, pareto_front  # noqa: E402
+from learn.compare import MOVING_MSE, Yardstick, pareto_front  # noqa: E402
 from sim.errors import InputError  # noqa: E402
 from sim.trajectory import atomic_path  # noqa: E402
 
@@ -68,14 +70,18 @@ def _shades(rows: Sequence[dict]) -> list[tuple[tuple[float, float, float], obje
     return result
 
 
-def _place_labels(axes: Axes, points: Sequence[tuple[float, float]], labels: Sequence[str], colours: Sequence) -> None:
-    """Write each label at the nearest free place around its point: off the other labels, off all points, inside the axes."""
+def _place_labels(axes: Axes, points: Sequence[tuple[float, float]], labels: Sequence[str], colours: Sequence, lines: Sequence[np.ndarray]) -> None:
+    """Write each label at the nearest free place around its point: off the other labels, all points and lines ([n, 2]), inside the axes."""
     figure = axes.figure
     figure.canvas.draw()
     renderer, frame = figure.canvas.get_renderer(), axes.get_window_extent()
     pixels = axes.transData.transform(points)
     size = figure.dpi / 72
-    taken = [matplotlib.transforms.Bbox.from_bounds(x - 6 * size, y - 6 * size, 12 * size, 12 * size) for x, y in pixels]
+    taken = [Bbox.from_bounds(x - 7 * size, y - 7 * size, 14 * size, 14 * size) for x, y in pixels]
+    for line in lines:
+        for one, other in pairwise(axes.transData.transform(line)):
+            count = max(int(math.dist(one, other) / (4 * size)), 1)
+            taken += [Bbox.from_bounds(x - size, y - size, 2 * size, 2 * size) for x, y in np.linspace(one, other, count + 1)]
     # The crowded points choose first.
     crowd = [sum(math.exp(-math.dist(one, other) / (40 * size)) for other in pixels) for one in pixels]
     for index in sorted(range(len(labels)), key=lambda index: -crowd[index]):
@@ -88,7 +94,7 @@ def _place_labels(axes: Axes, points: Sequence[tuple[float, float]], labels: Seq
                 reach_x, reach_y = radius * size * math.cos(angle), radius * size * math.sin(angle)
                 left = pixels[index][0] + reach_x - (0 if math.cos(angle) > 0.2 else wide if math.cos(angle) < -0.2 else wide / 2)
                 low = pixels[index][1] + reach_y - high / 2
-                box = matplotlib.transforms.Bbox.from_bounds(left, low, wide, high)
+                box = Bbox.from_bounds(left, low, wide, high)
                 clash = sum(
                     max(0, min(box.x1, other.x1) - max(box.x0, other.x0)) * max(0, min(box.y1, other.y1) - max(box.y0, other.y0)) for other in taken
                 )
@@ -107,41 +113,47 @@ def _place_labels(axes: Axes, points: Sequence[tuple[float, float]], labels: Seq
         )
 
 
-def error_over_run_time(rows: Sequence[dict], path: str | Path, yardstick: Yardstick = Yardstick()) -> None:
+def error_over_run_time(rows: Sequence[dict], path: str | Path, yardstick: Yardstick = MOVING_MSE) -> None:
     """Error over seconds per frame, log-log, one point a contender, whiskers from least to most over trajectories and timings.
 
-    The front of solver and learned contenders is a line, the chaos floor a band below which errors mean nothing. An error of zero (the
-    reference) has no place on a log axis: it sits on the lower edge. Contenders without error or time are listed under the axes.
+    The front of solver and learned contenders is a line, the chaos floor a band in which errors mean nothing. An error of zero (the
+    reference) has no place on a log axis: it sits at the lower edge. Contenders without error or time are listed under the axes.
     """
     scene = _one_scene(rows)
     shown = [row for row in rows if row["kind"] not in ("floor", "oracle")]
     drawn = [row for row in shown if yardstick.of(row) is not None and row["seconds_per_frame"]]
     left_out = [f"{row['contender']} ({row['status']})" for row in shown if not any(row is other for other in drawn)]
     floors = [yardstick.of(row) for row in rows if row["kind"] == "floor" and yardstick.of(row)]
-    positive = [yardstick.of(row) for row in drawn if yardstick.of(row) > 0] + floors
+    positive = [yardstick.of(row) for row in drawn if yardstick.of(row) > 0]
     low = 10 ** (math.floor(math.log10(min(positive))) - 1) if positive else 1e-9
+    ground = 2 * low  # where an error of zero is drawn
+    lines = []
     with plt.rc_context(_STYLE):
         figure, axes = plt.subplots(figsize=(8.5, 5.6), layout="constrained")
         axes.set(xscale="log", yscale="log", xlabel="run time, seconds per frame", ylabel=str(yardstick), title=f"{scene}: error over run time")
-        points = [(row["seconds_per_frame"], max(yardstick.of(row), low)) for row in drawn]
+        points = [(row["seconds_per_frame"], max(yardstick.of(row), ground)) for row in drawn]
         for row, (x, y) in zip(drawn, points, strict=True):
             colour = COLOURS[row["kind"]]
-            worst, least = ({"of": yardstick.of(row["spread"][end])}["of"] for end in ("max", "min"))
-            if y > low and worst is not None and least:
-                axes.plot([x, x], [max(least, low), worst], color=colour, lw=1, alpha=0.45, zorder=2)
+            worst, least = yardstick.of(row["spread"]["max"]), yardstick.of(row["spread"]["min"])
+            if y > ground and worst is not None and least:
+                lines.append(np.array([(x, max(least, low)), (x, worst)]))
+                axes.plot(*lines[-1].T, color=colour, lw=1, alpha=0.45, zorder=2)
             if row.get("timing_spread"):
-                axes.plot(row["timing_spread"]["seconds_per_frame"], [y, y], color=colour, lw=1, alpha=0.45, zorder=2)
+                lines.append(np.array([(seconds, y) for seconds in row["timing_spread"]["seconds_per_frame"]]))
+                axes.plot(*lines[-1].T, color=colour, lw=1, alpha=0.45, zorder=2)
             hollow = {"markerfacecolor": "white"} if row["failures"] else {}
             axes.plot(x, y, MARKERS[row["kind"]], color=colour, markersize=13 if row["kind"] == "reference" else 8, zorder=4, clip_on=False, **hollow)
-        front = [(row["seconds_per_frame"], max(yardstick.of(row), low)) for row in pareto_front(list(rows), yardstick)]
+        front = [(row["seconds_per_frame"], max(yardstick.of(row), ground)) for row in pareto_front(list(rows), yardstick)]
         if len(front) > 1:
-            axes.plot(*zip(*front, strict=True), color="#444444", lw=1.2, ls=(0, (4, 2)), zorder=1)
-        if floors:
+            lines.append(np.array(front))
+            axes.plot(*lines[-1].T, color="#444444", lw=1.2, ls=(0, (4, 2)), zorder=1)
+        band = bool(floors) and floors[0] > low
+        if band:
             axes.axhspan(low, floors[0], color=COLOURS["floor"], alpha=0.18, lw=0, zorder=0)
         if points:
             times, errors = np.array(points).T
             axes.set_xlim(times.min() / 3, times.max() * 3)
-            axes.set_ylim(low, max(errors.max(), *(floors or [low])) * 4)
+            axes.set_ylim(low, max(errors.max(), *floors) * 4 if floors else errors.max() * 4)
         kinds = [kind for kind in COLOURS if any(row["kind"] == kind for row in drawn)]
         handles = [
             plt.Line2D([], [], color=COLOURS[kind], marker=MARKERS[kind], ls="", markersize=11 if kind == "reference" else 7, label=KIND_NAMES[kind])
@@ -151,18 +163,20 @@ def error_over_run_time(rows: Sequence[dict], path: str | Path, yardstick: Yards
             handles.append(plt.Line2D([], [], color="#444444", marker="o", markerfacecolor="white", ls="", label="some rollouts failed"))
         if len(front) > 1:
             handles.append(plt.Line2D([], [], color="#444444", lw=1.2, ls=(0, (4, 2)), label="Pareto front"))
-        if floors:
+        if band:
             handles.append(plt.Rectangle((0, 0), 1, 1, color=COLOURS["floor"], alpha=0.3, lw=0, label=KIND_NAMES["floor"]))
-        figure.legend(handles=handles, loc="outside upper center", ncols=4)
+        figure.legend(handles=handles, loc="outside upper center", ncols=len(handles) if len(handles) < 6 else math.ceil(len(handles) / 2))
         notes = []
         if any(yardstick.of(row) == 0 for row in drawn):
-            notes.append("On the lower edge: error exactly zero.")
+            notes.append("At the lower edge: error exactly zero.")
+        if floors and not band:
+            notes.append(f"Chaos floor below the axis: {floors[0]:.1e}.")
         if left_out:
             notes.append("Not drawn: " + "; ".join(left_out) + ".")
         if notes:
             figure.supxlabel("\n".join(notes), fontsize=8.5, color="#555555", wrap=True)
         labels = [row["contender"] for row in drawn]
-        _place_labels(axes, points, labels, [COLOURS[row["kind"]] for row in drawn])
+        _place_labels(axes, points, labels, [COLOURS[row["kind"]] for row in drawn], lines)
         _save(figure, path)
 
 
@@ -210,9 +224,10 @@ def kinetic_energy(rows: Sequence[dict], path: str | Path) -> None:
         truth = _curve(rows[0], "kinetic_energy_true", "median")
         axes.plot(time, truth, color=COLOURS["reference"], lw=2.6, label=f"truth ({rows[0]['reference']})")
         for row, (colour, dash) in zip(shown, _shades(shown), strict=True):
-            axes.plot(time, _curve(row, "kinetic_energy", "median"), color=colour, ls=dash, lw=2 if row["kind"] == "learned" else 1.3, label=row["contender"])
-        # Falling for ever is not worth the scale: the truth keeps at least a third of the height.
-        axes.set_ylim(0, 3 * float(np.nanmax(truth)) if np.nanmax(truth) > 0 else None)
+            width = 2 if row["kind"] == "learned" else 1.3
+            axes.plot(time, _curve(row, "kinetic_energy", "median"), color=colour, ls=dash, lw=width, label=row["contender"])
+        # A contender that falls for ever is not worth the scale: the truth keeps most of the height.
+        axes.set_ylim(0, 1.5 * float(np.nanmax(truth)) if np.nanmax(truth) > 0 else None)
         figure.legend(loc="outside right center")
         _save(figure, path)
 
