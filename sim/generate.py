@@ -364,27 +364,24 @@ def _run_workers(out: Path, shards: list[Shard], jobs: int, teacher: Callable[[]
             # Only the worker may hold its end: its death then reads as the end of the pipe.
             theirs.close()
             workers[ours] = process
-            ours.send(pending.popleft())
         while workers:
             for connection in wait(list(workers)):
                 try:
                     kind, detail = connection.recv()
-                except (EOFError, ConnectionResetError):
+                    if kind == "shard":
+                        connection.send(pending.popleft() if pending else None)
+                except (EOFError, ConnectionError):
                     raise RunError(_epitaph(workers[connection])) from None
                 if kind == "trajectory":
                     progress.trajectory(detail)
-                elif kind == "shard":
-                    if pending:
-                        connection.send(pending.popleft())
-                    else:
-                        connection.send(None)
-                        workers.pop(connection).join()
-                        connection.close()
-                else:
+                elif kind == "last":
+                    workers.pop(connection).join()
+                    connection.close()
+                elif kind == "error":
                     raise RunError(detail)
     finally:
         for process in workers.values():
-            process.terminate()
+            process.kill()
         for connection, process in workers.items():
             process.join()
             connection.close()
@@ -398,11 +395,16 @@ def _epitaph(process: multiprocessing.process.BaseProcess) -> str:
 
 
 def _work(connection: Connection, out: Path, teacher: Callable[[], Teacher]) -> None:
-    """A worker process: make the shards that arrive until None does. Ctrl-C is the parent's to handle."""
+    """A worker process: ask for shards and make them until None arrives. Messages: (shard | trajectory | last | error, detail).
+
+    Signals to the whole group are the parent's to handle; it kills its workers.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     try:
         simulator = teacher()
+        connection.send(("shard", None))
         while (shard := connection.recv()) is not None:
             try:
                 _make_shard(out, shard, simulator, lambda status: connection.send(("trajectory", status)))
@@ -410,7 +412,8 @@ def _work(connection: Connection, out: Path, teacher: Callable[[], Teacher]) -> 
                 why = os.strerror(error.errno) if error.errno else str(error)
                 connection.send(("error", f"{out / shard.name}: cannot be written: {why}; finished shards are kept"))
                 return
-            connection.send(("shard", shard.name))
+            connection.send(("shard", None))
+        connection.send(("last", None))
     except (EOFError, BrokenPipeError):
         return
     except Exception as error:  # A fault of ours: the parent stops with one line, the traceback goes to the log.

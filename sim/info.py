@@ -167,8 +167,7 @@ def _same(stated: dict | None, found: dict | None) -> bool:
     if stated is None or found is None:
         return stated is found
     try:
-        return stated.keys() == found.keys() and all(
-            np.allclose(np.asarray(stated[key], float), np.asarray(value, float), rtol=1e-6, atol=1e-12, equal_nan=True) for key, value in found.items()
-        )
-    except (TypeError, ValueError):
+        pairs = [(np.asarray(stated[key], float), np.asarray(value, float)) for key, value in found.items()]
+        return stated.keys() == found.keys() and all(np.allclose(*pair, rtol=1e-6, atol=1e-12, equal_nan=True) for pair in pairs)
+    except (KeyError, TypeError, ValueError):
         return False

@@ -7,18 +7,18 @@ from sim.taichi_runtime import ti
 def wall(v, node, low, high, friction: ti.template(), coefficient):
     """Velocity of a grid node after contact with the container's walls.
 
-    A node on or behind a wall may not move into it: the inward normal component is removed, and Coulomb friction takes up to
+    A node on a wall may not move into it: the inward normal component is removed, and Coulomb friction takes up to
     ``coefficient`` times it from the tangential one (Stomakhin et al. 2013, sec. 8). ``friction`` is "slip", "coulomb" or
     "sticky" at compile time. node, low, high: [dim] indices; low and high lie exactly on the walls.
     """
     for axis in ti.static(range(v.n)):
-        behind_low, behind_high = node[axis] <= low[axis], node[axis] >= high[axis]
-        if behind_low or behind_high:
+        at_low, at_high = node[axis] == low[axis], node[axis] == high[axis]
+        if at_low or at_high:
             if ti.static(friction == "sticky"):
                 v = v * 0.0
             else:
                 normal = v[axis]
-                if (behind_low and normal < 0.0) or (behind_high and normal > 0.0):
+                if (at_low and normal < 0.0) or (at_high and normal > 0.0):
                     v[axis] = 0.0
                     if ti.static(friction == "coulomb"):
                         speed = v.norm()

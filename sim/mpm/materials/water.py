@@ -9,8 +9,8 @@ from sim.taichi_runtime import ti
 class WaterModel:
     """Tait pressure p = B (J^-gamma - 1), B = rho0 c^2 / gamma (Monaghan 1994, eq. 3), tau = -J p I; J <- J (1 + dt tr grad v).
 
-    J is kept at or below 1: a particle that has been pulled away from its neighbours must not come back with room to spare,
-    which loses volume at every splash (free water carries no tension at these scales).
+    J may exceed 1: water then pulls, by less than B. Holding J at 1 was tried and loses the record of how far particles have
+    parted; a settled drop ended a third too high.
     """
 
     state = ("J",)
@@ -37,7 +37,7 @@ class WaterModel:
 
     @ti.func
     def kirchhoff(self, p, gradient_dt):
-        J = ti.min(self.J[p] * (1.0 + gradient_dt.trace()), 1.0)
+        J = self.J[p] * (1.0 + gradient_dt.trace())
         self.J[p] = J
         pressure = self.parameters[0] * (J ** (-self.parameters[1]) - 1.0)
         return ti.Matrix.identity(ti.f32, self.dim) * (-J * pressure)
