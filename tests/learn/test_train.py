@@ -288,7 +288,7 @@ def test_load_config(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("content", "key"), [
-    ("", "file"), ("- 1", "file"), ("a: [", "file"), ("\x00", "file"), ("[" * 1200, "file"), ({**GOOD, "modle": "x"}, "modle"),
+    ("", "file"), ("- 1", "file"), ("a: [", "file"), ("\x00", "file"), ("[" * 400, "file"), ({**GOOD, "modle": "x"}, "modle"),
     ({"model": "dummy"}, "training"), ({**GOOD, "training": {}}, "exactly one of steps and minutes"),
     ({**GOOD, "training": {"steps": 1, "minutes": 1}}, "exactly one"), ({**GOOD, "training": {"steps": 0}}, r"training\.steps = 0"),
     ({**GOOD, "training": {"steps": 1, "lr": 1}}, r"training\.lr"), ({**GOOD, "training": {"minutes": float("nan")}}, r"training\.minutes"),
