@@ -68,8 +68,6 @@ def rotate3(A: ti.template(), Q: ti.template(), p: ti.template(), q: ti.template
         A[q, q] += t * apq
         A[p, q] = 0.0
         arp, arq = A[r, p], A[r, q]
-        if ti.static(r < p):
-            arp, arq = A[r, p], A[r, q]
         A[r, p] = c * arp - s * arq
         A[r, q] = s * arp + c * arq
         A[p, r], A[q, r], A[q, p] = A[r, p], A[r, q], 0.0
@@ -82,7 +80,7 @@ def rotate3(A: ti.template(), Q: ti.template(), p: ti.template(), q: ti.template
 @ti.func
 def decompose3(s):
     """Eigenvalues and eigenvectors (columns) of a symmetric 3x3 matrix by four cyclic Jacobi sweeps (quadratic convergence)."""
-    A = ti.Matrix([[s[0], s[5], s[4]], [s[5], s[1], s[3]], [s[4], s[3], s[2]]])
+    A = unpack3(s)
     Q = ti.Matrix.identity(ti.f32, 3)
     for _ in range(4):
         rotate3(A, Q, 0, 1)
@@ -94,27 +92,28 @@ def decompose3(s):
 @ti.func
 def assemble3(values, Q):
     """Q diag(values) Q^T as (xx, yy, zz, yz, xz, xy)."""
-    M = Q @ ti.Matrix([[values[0], 0.0, 0.0], [0.0, values[1], 0.0], [0.0, 0.0, values[2]]]) @ Q.transpose()
+    return pack3(Q @ ti.Matrix([[values[0], 0.0, 0.0], [0.0, values[1], 0.0], [0.0, 0.0, values[2]]]) @ Q.transpose())
+
+
+@ti.func
+def unpack2(s):
+    """Full 2x2 matrix of a symmetric vector."""
+    return ti.Matrix([[s[0], s[2]], [s[2], s[1]]])
+
+
+@ti.func
+def unpack3(s):
+    """Full 3x3 matrix of a symmetric vector."""
+    return ti.Matrix([[s[0], s[5], s[4]], [s[5], s[1], s[3]], [s[4], s[3], s[2]]])
+
+
+@ti.func
+def pack2(M):
+    """Symmetric vector of a symmetric 2x2 matrix."""
+    return ti.Vector([M[0, 0], M[1, 1], M[0, 1]])
+
+
+@ti.func
+def pack3(M):
+    """Symmetric vector of a symmetric 3x3 matrix."""
     return ti.Vector([M[0, 0], M[1, 1], M[2, 2], M[1, 2], M[0, 2], M[0, 1]])
-
-
-@ti.func
-def unpack(s):
-    """Full matrix of a symmetric vector."""
-    M = ti.Matrix.zero(ti.f32, 2, 2) if ti.static(s.n == 3) else ti.Matrix.zero(ti.f32, 3, 3)
-    if ti.static(s.n == 3):
-        M = ti.Matrix([[s[0], s[2]], [s[2], s[1]]])
-    else:
-        M = ti.Matrix([[s[0], s[5], s[4]], [s[5], s[1], s[3]], [s[4], s[3], s[2]]])
-    return M
-
-
-@ti.func
-def pack(M):
-    """Symmetric vector of a symmetric matrix."""
-    s = ti.Vector.zero(ti.f32, 3) if ti.static(M.n == 2) else ti.Vector.zero(ti.f32, 6)
-    if ti.static(M.n == 2):
-        s = ti.Vector([M[0, 0], M[1, 1], M[0, 1]])
-    else:
-        s = ti.Vector([M[0, 0], M[1, 1], M[2, 2], M[1, 2], M[0, 2], M[0, 1]])
-    return s

@@ -2,8 +2,15 @@
 
 import numpy as np
 
-from sim.mpm.decomposition import assemble2, assemble3, decompose2, decompose3, expm1, log1p, pack, unpack
+from sim.mpm.decomposition import assemble2, assemble3, decompose2, decompose3, expm1, log1p, pack2, pack3, unpack2, unpack3
 from sim.taichi_runtime import ti
+
+
+@ti.func
+def push_forward(B, G):
+    """(I + G)(I + B)(I + G)^T - I without forming I + B."""
+    BG = B @ G.transpose()
+    return B + G + G.transpose() + G @ G.transpose() + BG + BG.transpose() + G @ BG
 
 
 @ti.data_oriented
@@ -82,37 +89,34 @@ class SandModel:
     @ti.func
     def kirchhoff(self, p, gradient_dt):
         """Trial b <- (I + dt grad v) b (I + dt grad v)^T, return map, Kirchhoff stress."""
-        B, G = unpack(self.b[p]), gradient_dt
-        BG = B @ G.transpose()
-        # (I + G)(I + B)(I + G)^T - I without forming I + B.
-        trial = pack(B + G + G.transpose() + G @ G.transpose() + BG + BG.transpose() + G @ BG)
-        tau = trial
+        tau = ti.Matrix.zero(ti.f32, self.dim, self.dim)
         if ti.static(self.dim == 2):
+            trial = pack2(push_forward(unpack2(self.b[p]), gradient_dt))
             values, frame = decompose2(trial)
             e, gain, moved = self.return_map(self.principal(values), self.v[p])
-            tau = assemble2(self.stress(e), frame)
+            tau = unpack2(assemble2(self.stress(e), frame))
             if moved:
                 trial = assemble2(ti.Vector([expm1(2.0 * e[0]), expm1(2.0 * e[1])]), frame)
-            self.v[p] = gain
+            self.b[p], self.v[p] = trial, gain
         else:
+            trial = pack3(push_forward(unpack3(self.b[p]), gradient_dt))
             values, frame = decompose3(trial)
             e, gain, moved = self.return_map(self.principal(values), self.v[p])
-            tau = assemble3(self.stress(e), frame)
+            tau = unpack3(assemble3(self.stress(e), frame))
             if moved:
                 trial = assemble3(ti.Vector([expm1(2.0 * e[0]), expm1(2.0 * e[1]), expm1(2.0 * e[2])]), frame)
-            self.v[p] = gain
-        self.b[p] = trial
-        return unpack(tau)
+            self.b[p], self.v[p] = trial, gain
+        return tau
 
     @ti.func
     def energy_density(self, p):
         """psi = mu e : e + lambda / 2 (tr e)^2."""
         e = ti.Vector.zero(ti.f32, self.dim)
         if ti.static(self.dim == 2):
-            values, _ = decompose2(self.b[p])
+            values, frame = decompose2(self.b[p])
             e = self.principal(values)
         else:
-            values, _ = decompose3(self.b[p])
+            values, frame = decompose3(self.b[p])
             e = self.principal(values)
         return self.parameters[1] * e.norm_sqr() + 0.5 * self.parameters[0] * e.sum() ** 2
 
