@@ -21,7 +21,6 @@ import matplotlib.pyplot as plt  # noqa: E402 - the backend must be chosen first
 from matplotlib.axes import Axes  # noqa: E402
 from matplotlib.colors import to_rgb  # noqa: E402
 from matplotlib.figure import Figure  # noqa: E402
-from matplotlib.transforms import Bbox  # noqa: E402
 
 from learn.compare import MOVING_MSE, Yardstick, pareto_front  # noqa: E402
 from sim.errors import InputError  # noqa: E402
@@ -70,47 +69,44 @@ def _shades(rows: Sequence[dict]) -> list[tuple[tuple[float, float, float], obje
     return result
 
 
+#: Where a label may stand: (distance [points], direction) around its point, best first.
+_ANGLES = (0, 180, 35, -35, 145, -145, 90, -90, 65, -65, 115, -115)
+_PLACES = [(radius, math.radians(angle)) for radius in (9, 14, 20, 28, 38, 50, 64, 80) for angle in _ANGLES]
+
+
 def _place_labels(axes: Axes, points: Sequence[tuple[float, float]], labels: Sequence[str], colours: Sequence, lines: Sequence[np.ndarray]) -> None:
     """Write each label at the nearest free place around its point: off the other labels, all points and lines ([n, 2]), inside the axes."""
     figure = axes.figure
     figure.canvas.draw()
-    renderer, frame = figure.canvas.get_renderer(), axes.get_window_extent()
+    renderer, frame, size = figure.canvas.get_renderer(), axes.get_window_extent(), figure.dpi / 72
     pixels = axes.transData.transform(points)
-    size = figure.dpi / 72
-    taken = [Bbox.from_bounds(x - 7 * size, y - 7 * size, 14 * size, 14 * size) for x, y in pixels]
+    strokes = [pixels[:0]]
     for line in lines:
         for one, other in pairwise(axes.transData.transform(line)):
-            count = max(int(math.dist(one, other) / (4 * size)), 1)
-            taken += [Bbox.from_bounds(x - size, y - size, 2 * size, 2 * size) for x, y in np.linspace(one, other, count + 1)]
-    # The crowded points choose first.
-    crowd = [sum(math.exp(-math.dist(one, other) / (40 * size)) for other in pixels) for one in pixels]
-    for index in sorted(range(len(labels)), key=lambda index: -crowd[index]):
+            strokes.append(np.linspace(one, other, max(int(math.dist(one, other) / (4 * size)), 1) + 1))
+    strokes = np.concatenate(strokes)
+    # Taken boxes, [n, 4]: left, low, right, high.
+    taken = np.concatenate([np.hstack([pixels - 7 * size, pixels + 7 * size]), np.hstack([strokes - size, strokes + size])])
+    directions = np.array([(math.cos(angle), math.sin(angle)) for _, angle in _PLACES])
+    radii = np.array([radius for radius, _ in _PLACES])
+    distances = np.linalg.norm(pixels[:, None] - pixels, axis=2)
+    crowd = np.exp(-distances / (40 * size)).sum(axis=1)
+    for index in np.argsort(-crowd, kind="stable"):  # the crowded points choose first
         text = axes.annotate(labels[index], points[index], textcoords="offset points", xytext=(0, 0), fontsize=8.5, color=colours[index])
         extent = text.get_window_extent(renderer)
-        wide, high = extent.width, extent.height
-        best, least = (0.0, 0.0), math.inf
-        for radius in (9, 14, 20, 28, 38, 50, 64, 80):
-            for angle in np.radians((0, 180, 35, -35, 145, -145, 90, -90, 65, -65, 115, -115)):
-                reach_x, reach_y = radius * size * math.cos(angle), radius * size * math.sin(angle)
-                left = pixels[index][0] + reach_x - (0 if math.cos(angle) > 0.2 else wide if math.cos(angle) < -0.2 else wide / 2)
-                low = pixels[index][1] + reach_y - high / 2
-                box = Bbox.from_bounds(left, low, wide, high)
-                clash = sum(
-                    max(0, min(box.x1, other.x1) - max(box.x0, other.x0)) * max(0, min(box.y1, other.y1) - max(box.y0, other.y0)) for other in taken
-                )
-                inside = box.x0 >= frame.x0 and box.x1 <= frame.x1 and box.y0 >= frame.y0 and box.y1 <= frame.y1
-                cost = clash + (0 if inside else 1e6)
-                if cost < least:
-                    least, best, chosen, far = cost, (left, low), box, radius > 20
-            if least == 0:
-                break
-        taken.append(chosen)
-        text.remove()
-        spot = ((best[0] - pixels[index][0]) / size, (best[1] - pixels[index][1]) / size)
-        axes.annotate(
-            labels[index], points[index], textcoords="offset points", xytext=spot, fontsize=8.5, color=colours[index], annotation_clip=False,
-            arrowprops={"arrowstyle": "-", "color": "#9A9A9A", "lw": 0.6, "shrinkA": 0, "shrinkB": 4} if far else None,
-        )
+        anchor = np.where(directions[:, 0] > 0.2, 0.0, np.where(directions[:, 0] < -0.2, 1.0, 0.5))
+        low = pixels[index] + radii[:, None] * size * directions - np.stack([anchor * extent.width, np.full(len(radii), extent.height / 2)], 1)
+        boxes = np.hstack([low, low + [extent.width, extent.height]])
+        sides = np.minimum(boxes[:, None, 2:], taken[:, 2:]) - np.maximum(boxes[:, None, :2], taken[:, :2])
+        clash = np.clip(sides, 0, None).prod(axis=2).sum(axis=1)
+        outside = (low < [frame.x0, frame.y0]).any(axis=1) | (boxes[:, 2:] > [frame.x1, frame.y1]).any(axis=1)
+        best = int(np.argmin(clash + 1e6 * outside))
+        taken = np.vstack([taken, boxes[best]])
+        text.set_position(tuple((low[best] - pixels[index]) / size))
+        if radii[best] > 20:
+            leader = {"arrowstyle": "-", "color": "#9A9A9A", "lw": 0.6, "shrinkA": 0, "shrinkB": 4}
+            edge = np.clip(pixels[index], boxes[best, :2], boxes[best, 2:])
+            axes.annotate("", points[index], textcoords="offset points", xytext=tuple((edge - pixels[index]) / size), arrowprops=leader)
 
 
 def error_over_run_time(rows: Sequence[dict], path: str | Path, yardstick: Yardstick = MOVING_MSE) -> None:

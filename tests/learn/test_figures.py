@@ -1,0 +1,123 @@
+"""Figures: every contender is in them, labels keep apart and inside, files are whole and repeatable."""
+
+import math
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+
+from learn import figures
+from sim.errors import InputError
+
+
+def row(name, kind, error, seconds, failures=0, scene="sand"):
+    def curve(level):
+        parts = (("median", 1), ("min", 0.5), ("max", 2))
+        return {part: [None if level is None else level * k * factor for k in (1, 2, 3)] for part, factor in parts}
+
+    return {
+        "scene": scene, "reference": "teacher", "contender": name, "kind": kind,
+        "failures": failures, "status": "failed in 1 of 3" if failures else "ok",
+        "rollout_mse_moving": {"all": error}, "seconds_per_frame": seconds, "frame_step": 0.01,
+        "timing_spread": {"seconds_per_frame": [seconds * 0.9, seconds * 1.2], "n": 5} if seconds else None,
+        "spread": {end: {"rollout_mse_moving": {"all": error and error * factor}} for end, factor in (("min", 0.5), ("max", 2))},
+        "curves": {"frame": [1, 50, 100], "mse": curve(error), "kinetic_energy": curve(1.1), "kinetic_energy_true": curve(1.0)},
+    }
+
+
+ROWS = [
+    row("teacher", "reference", 0.0, 2e-3), *(row(f"dt x{k}", "solver", 1e-6 * k, 2e-3 / k) for k in (2, 3, 4)),
+    *(row(f"twin {k}", "solver", 1.02e-6 * k, 2.05e-3 / k) for k in (2, 3, 4)),
+    row("gns", "learned", 1e-5, 1e-3), row("shaky", "learned", 3e-5, 2e-4, failures=1), row("dead", "learned", None, 1e-3, failures=3),
+    row("frozen", "trivial", 1e-2, 1e-6), row("oracle", "oracle", 0.0, 1e-5), row("floor", "floor", 3e-7, 2e-3),
+]
+
+
+@pytest.fixture
+def kept(monkeypatch):
+    """The figures that were saved, kept open."""
+    found = []
+    monkeypatch.setattr(figures.plt, "close", found.append)
+    yield found
+    monkeypatch.undo()
+    plt.close("all")
+
+
+def test_error_over_run_time(tmp_path, kept):
+    path = tmp_path / "figure.png"
+    figures.error_over_run_time(ROWS, path)
+    figure, axes = kept[0], kept[0].axes[0]
+    texts = [text for text in axes.texts if text.get_text()]
+    assert {text.get_text() for text in texts} == {row["contender"] for row in ROWS} - {"dead", "oracle", "floor"}
+    frame, boxes = axes.get_window_extent(), [text.get_window_extent() for text in texts]
+    for index, box in enumerate(boxes):
+        assert box.x0 >= frame.x0 - 1 and box.x1 <= frame.x1 + 1 and box.y0 >= frame.y0 - 1 and box.y1 <= frame.y1 + 1, texts[index]
+        for other in range(index):
+            wide, high = (min(getattr(box, end), getattr(boxes[other], end)) for end in ("x1", "y1"))
+            apart = wide - max(box.x0, boxes[other].x0) < 1 or high - max(box.y0, boxes[other].y0) < 1
+            assert apart, (texts[index], texts[other])
+    notes = figure._supxlabel.get_text()
+    assert "dead (failed" in notes and "error exactly zero" in notes
+    legend = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert legend == ["reference", "solver ladder", "learned", "trivial", "some rollouts failed", "Pareto front", "chaos floor"]
+    assert path.stat().st_size > 5000
+
+
+def test_a_chaos_floor_below_the_axis_is_said(tmp_path, kept):
+    figures.error_over_run_time([ROWS[0], ROWS[1], row("floor", "floor", 1e-15, 1e-3)], tmp_path / "figure.png")
+    assert "Chaos floor below the axis: 1.0e-15" in kept[0]._supxlabel.get_text()
+    assert kept[0].axes[0].get_ylim()[0] > 1e-9
+
+
+def test_curves_show_every_contender(tmp_path, kept):
+    figures.error_over_time(ROWS, tmp_path / "error.svg")
+    figures.kinetic_energy(ROWS, tmp_path / "energy.svg")
+    error, energy = ([text.get_text() for text in figure.legends[0].get_texts()] for figure in kept)
+    assert set(error) == {row["contender"] for row in ROWS} - {"teacher", "oracle", "dead"}
+    assert energy[0] == "truth (teacher)" and {"gns", "frozen", "dt x4"} < set(energy) and "oracle" not in energy
+    np.testing.assert_allclose(kept[1].axes[0].lines[0].get_xdata(), [0.01, 0.5, 1.0])
+
+
+def test_equal_rows_give_equal_files(tmp_path):
+    for name in ("one.svg", "two.svg"):
+        figures.error_over_time(ROWS, tmp_path / name)
+    assert (tmp_path / "one.svg").read_bytes() == (tmp_path / "two.svg").read_bytes()
+
+
+@pytest.mark.parametrize("rows", [[], [ROWS[0], row("gns", "learned", 1, 1, scene="water")]])
+def test_a_figure_shows_one_scene(tmp_path, rows):
+    for figure in (figures.error_over_run_time, figures.error_over_time, figures.kinetic_energy):
+        with pytest.raises(ValueError, match="one scene"):
+            figure(rows, tmp_path / "figure.png")
+    assert not list(tmp_path.iterdir())
+
+
+def write_run(folder, steps):
+    folder.mkdir()
+    log = "\n".join(f"{10 * k},{k},{math.exp(-k / 20)},1e-4" for k in range(1, steps))
+    (folder / "log.csv").write_text("step,seconds,loss,lr\n" + log + "\n")
+    (folder / "validation.csv").write_text("step,seconds,rollout_mse,spacing_ratio\n100,10,0.1,0.9\n200,20,0.05,0.95\n")
+    return folder
+
+
+def test_training_curve(tmp_path, kept):
+    figures.training_curve({"gns": write_run(tmp_path / "a", 50), "emulator": write_run(tmp_path / "b", 30)}, tmp_path / "training.png")
+    above, below = kept[0].axes
+    assert [text.get_text() for text in kept[0].legends[0].get_texts()] == ["gns (490 steps)", "emulator (290 steps)"]
+    np.testing.assert_allclose(below.lines[0].get_xydata(), [[10 / 60, 0.1], [20 / 60, 0.05]])
+    assert len(above.lines) == 4
+
+
+def test_smooth_is_a_running_median():
+    np.testing.assert_array_equal(figures._smooth(np.array([1.0, 9.0, 2.0, 3.0]), 3), [5.0, 2.0, 3.0, 2.5])
+
+
+@pytest.mark.parametrize("content", [None, "step,seconds\n1,2\n", "step,seconds,loss\n1,2,x\n", "step,seconds,loss\n1,2\n"])
+def test_a_broken_log_is_named(tmp_path, content):
+    folder = write_run(tmp_path / "run", 5)
+    (folder / "log.csv").unlink()
+    if content is not None:
+        (folder / "log.csv").write_text(content)
+    with pytest.raises(InputError, match="log.csv: columns"):
+        figures.training_curve({"gns": folder}, tmp_path / "training.png")
+    assert not (tmp_path / "training.png").exists()
