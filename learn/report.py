@@ -132,6 +132,10 @@ def _horizons(rows: Iterable[Mapping]) -> list[str]:
     return sorted(found, key=lambda at: (at == "all", int(at) if at.isdigit() else 0))
 
 
+def _horizon_names(horizons: Sequence[str]) -> list[str]:
+    return ["all" if at == "all" else "1 frame" if at == "1" else f"{at} frames" for at in horizons]
+
+
 def _by_kind(rows: Sequence[dict]) -> list[dict]:
     """Rows in the order of ``KINDS``, otherwise as they come; kinds unknown here go last."""
     order = list(KINDS)
@@ -159,8 +163,9 @@ def _error_cell(table: _Table, row: Mapping, key: str, at: str) -> _Cell:
     spread = row.get("spread", {})
     low, high = (_at(spread.get(end, {}), key, at) for end in ("min", "max"))
     small = ""
-    if at == "all" and row.get("runs", 1) > 1 and low is not None and low != high:
-        small = f"{number(low)} to {number(high) if high is not None else 'failed'}"
+    if at == "all" and row.get("runs", 1) > 1 and low is not None:
+        ends = (number(low), "failed" if high is None else number(high))
+        small = " to ".join(ends) if ends[0] != ends[1] else ""
     return _Cell(number(value), small)
 
 
@@ -179,7 +184,7 @@ def _contenders(rows: Sequence[dict]) -> _Table:
     horizons = _horizons(rows)
     # Without static particles both means are the same numbers: shown once.
     two = any(_at(row, "rollout_mse", at) != _at(row, "rollout_mse_moving", at) for row in rows for at in horizons)
-    names = ["one step", *(f"{at} frames" if at != "all" else "all" for at in horizons)]
+    names = ["one step", *_horizon_names(horizons)]
     table = _Table(
         "Contenders: medians over the test trajectories; in small print the least and the greatest", names[:],
         [("MSE, all particles" if two else "MSE", len(names))],
@@ -188,7 +193,7 @@ def _contenders(rows: Sequence[dict]) -> _Table:
         table.columns += names
         table.groups.append(("MSE, moving particles", len(names)))
     table.columns += ["all / R²", "all / edge²", "Sinkhorn", "EMD, spacings", "spacing ratio", "energy MSE", "escaped, end (worst)", "diverges, s"]
-    table.groups += [("MSE", 2), ("clouds at ¼, ½, ¾, end of the run", 3), ("physics", 3)]
+    table.groups += [("MSE in other units", 2), ("clouds at ¼, ½, ¾, end of the run", 3), ("physics", 3)]
     table.columns += ["per frame", "per simulated s", "compile", "failures"]
     table.groups += [("run time", 3), ("", 1)]
     front = pareto_front(rows)
@@ -212,7 +217,7 @@ def _contenders(rows: Sequence[dict]) -> _Table:
         cells += _time_cells(table, row)
         failures = row.get("failures")
         cells.append(table.missing(None) if failures is None else table.noted(f"{failures} of {row['runs']}" if failures else "0", failed))
-        table.rows.append((heading, row["contender"], "on the front" if any(row is one for one in front) else "", cells))
+        table.rows.append((heading, row["contender"], "Pareto front" if any(row is one for one in front) else "", cells))
     return table
 
 
@@ -258,6 +263,8 @@ def _speed_ups(entries: Sequence[dict]) -> _Table:
         equal, rival = entry["equal_error"], entry["equal_time"]
         outcome = _OUTCOMES.get(equal["outcome"], equal["outcome"])
         paper, error = entry["speed_up_paper"], entry["error"]
+        unrivalled = "no solver rung is as cheap" if rival["rung"] is None else "the rung's error is zero"
+        unrivalled = "some rollouts failed" if error is None else unrivalled
         unpaid = "no such speed-up, or the cost of data and training is unknown"
         cells = [
             table.missing("reference not timed") if paper is None else _Cell(f"{number(paper)}×"),
@@ -265,7 +272,7 @@ def _speed_ups(entries: Sequence[dict]) -> _Table:
             _Cell(equal["rung"] or _DASH),
             table.missing("some rollouts failed") if error is None else _Cell(number(error)),
             table.missing("no solver rung is as cheap") if rival["rung"] is None else _Cell(number(rival["error"])),
-            table.missing(None) if rival["ratio"] is None else _Cell(f"{number(rival['ratio'])}×"),
+            table.missing(unrivalled) if rival["ratio"] is None else _Cell(f"{number(rival['ratio'])}×"),
             _Cell(rival["rung"] or _DASH),
             _Cell("never") if equal["outcome"] == "loses" else _rollouts(entry["break_even"], table, unpaid),
             _rollouts(entry["break_even_reference"], table, unpaid),
@@ -280,7 +287,7 @@ def _floors(rows: Sequence[dict]) -> _Table | None:
     if not any(row["kind"] == "floor" for row in rows):
         return None
     horizons = _horizons(rows)
-    table = _Table("MSE over the chaos floor, moving particles", [f"{at} frames" if at != "all" else "all" for at in horizons])
+    table = _Table("MSE over the chaos floor, moving particles", _horizon_names(horizons))
     for heading, row in _with_headings([row for row in rows if row["kind"] in ("solver", "learned", "trivial")]):
         over = over_floor(rows, row)
         cells = [_Cell(f"{number(over[at])}×") if over.get(at) is not None else table.missing(None) for at in horizons]
@@ -357,7 +364,7 @@ def _sections(rows: Sequence[dict], analysis: Sequence[dict], assets: Mapping[st
         tables = [_contenders(members), _speed_ups(entries) if entries else None, _floors(members), _costs(members)]
         facts = [
             f"truth: {reference}" if reference else "", f"{first['trajectories']} test trajectories" if first.get("trajectories") else "",
-            f"{first['frames']} predicted frames of {number(first['frame_step'])} s" if first.get("frames") and first.get("frame_step") else "",
+            f"{first['frames']} predicted frames of {duration(first['frame_step'])}" if first.get("frames") and first.get("frame_step") else "",
             f"{first['known_frames']} known frames" if first.get("known_frames") else "",
         ]
         sections.append({

@@ -307,6 +307,15 @@ class Pane:
     scale: Scale
 
 
+def _fitted(text: str, font, room: float) -> str:
+    """The text, cut with an ellipsis where it is wider than ``room`` pixels."""
+    if font.getlength(text) <= room:
+        return text
+    while text and font.getlength(text + "…") > room:
+        text = text[:-1]
+    return text.rstrip() + "…"
+
+
 class _Sheet:
     """Places panes in a grid, with a title over each, one bar per run of panes that share a scale, and a footer."""
 
@@ -314,7 +323,7 @@ class _Sheet:
         from matplotlib import get_data_path
         from PIL import Image, ImageDraw, ImageFont
 
-        unit = max(view.width / PANE_WIDTH, 0.75)  # the small panes of a strip keep readable text
+        unit = float(np.clip(view.width / PANE_WIDTH, 0.75, 1.1))  # the small panes of a strip keep readable text
         inset = round(MARGIN * view.width)  # text begins where the box begins
         face = str(Path(get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf")
         title_font, self.font = (ImageFont.truetype(face, max(9, round(points * unit))) for points in (19, 15))
@@ -339,7 +348,7 @@ class _Sheet:
         self.ground = Image.new("RGB", self.size, "white")
         draw = ImageDraw.Draw(self.ground)
         for x, top, text in marks:
-            draw.text((x, top + title / 2), text, INK, title_font, anchor="lm")
+            draw.text((x, top + title / 2), _fitted(text, title_font, view.width - inset), INK, title_font, anchor="lm")
         for row, line in enumerate(lines):
             if one_scale and row < rows - 1:
                 continue
@@ -382,7 +391,8 @@ class _Sheet:
         for corner, part in zip(self.corners, parts, strict=True):
             sheet.paste(Image.fromarray(part), corner)
         if footer:
-            ImageDraw.Draw(sheet).text(self.footer_at, footer, INK, self.font)
+            room = self.size[0] - 2 * self.footer_at[0]
+            ImageDraw.Draw(sheet).text(self.footer_at, _fitted(footer, self.font, room), INK, self.font)
         return np.asarray(sheet)
 
 

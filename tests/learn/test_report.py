@@ -138,7 +138,7 @@ def test_page_is_self_contained_and_begins_with_the_verdict(tmp_path, rows, asse
     assert any(attributes["src"].startswith("data:image/svg+xml") and attributes["alt"] == 'error "over" <time>' for attributes in media)
     assert "http:" not in text and "https:" not in text and "url(" not in text and "@import" not in text
     assert any(attributes.get("name") == "viewport" for _, attributes in page.tags)
-    for expected in ("Sand &amp; water", "make demo", "<dt>train</dt><dd>1, 2</dd>", "abc1", "numpy", "10 predicted frames of 0.01 s"):
+    for expected in ("Sand &amp; water", "make demo", "<dt>train</dt><dd>1, 2</dd>", "abc1", "numpy", "10 predicted frames of 10 ms"):
         assert expected in text
     assert [entry.name for entry in tmp_path.glob("*.html")] == ["report.html"]
 
@@ -159,7 +159,7 @@ def test_contenders_are_grouped_and_carry_the_figures_of_the_rows(tmp_path, rows
     columns = next(row for row in page.tables[next(iter(page.tables))] if row[0] == "contender")
     gns = dict(zip(columns[1:6], table["gns"][1:6], strict=True))
     # Columns repeat for the moving particles, so the first five are those of all particles.
-    assert gns["one step"] == "4.0e-4" and gns["1 frames"] == "4.0e-4" and gns["5 frames"] == "4.0e-4"
+    assert gns["one step"] == "4.0e-4" and gns["1 frame"] == "4.0e-4" and gns["5 frames"] == "4.0e-4"
     assert gns["100 frames"].startswith("–^") and gns["all"].startswith("4.0e-4")
     assert columns.count("one step") == 2
     assert table["gns"][columns.index("all / R²")].startswith("0.04")

@@ -198,6 +198,15 @@ def test_films_skip_frames_evenly(frames):
     assert len(set(np.diff(chosen))) <= 1
 
 
+def test_long_text_stays_in_its_pane():
+    from PIL import ImageFont
+
+    font = ImageFont.load_default(15)
+    cut = render._fitted("waterdrop, seed 8688832179248457", font, 100)
+    assert cut.endswith("…") and 60 < font.getlength(cut) <= 100
+    assert render._fitted("short", font, 100) == "short"
+
+
 def test_limits_read_well():
     assert [render._round_up(value) for value in (1.234, 0.0301, 99.5, 2.0, 0.0, float("nan"))] == pytest.approx([1.3, 0.031, 100.0, 2.0, 1.0, 1.0])
 
