@@ -21,7 +21,7 @@ import traceback
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
@@ -364,11 +364,15 @@ def _run_workers(out: Path, shards: list[Shard], jobs: int, teacher: Callable[[]
             # Only the worker may hold its end: its death then reads as the end of the pipe.
             theirs.close()
             workers[ours] = process
+        scenes = [scene for shard in shards for scene in shard.scenes.values()]
+        largest = max(scenes, key=lambda scene: len(scene.particle_type()))
         while workers:
             for connection in wait(list(workers)):
                 try:
                     kind, detail = connection.recv()
-                    if kind == "shard":
+                    if kind == "scene":
+                        connection.send(largest)
+                    elif kind == "shard":
                         connection.send(pending.popleft() if pending else None)
                 except (EOFError, ConnectionError):
                     raise RunError(_epitaph(workers[connection])) from None
@@ -395,7 +399,8 @@ def _epitaph(process: multiprocessing.process.BaseProcess) -> str:
 
 
 def _work(connection: Connection, out: Path, teacher: Callable[[], Teacher]) -> None:
-    """A worker process: ask for shards and make them until None arrives. Messages: (shard | trajectory | last | error, detail).
+    """A worker process: load the largest scene, so that fields are allocated and kernels compiled once, then ask for shards and
+    make them until None arrives. Messages to the parent: (scene | shard | trajectory | last | error, detail).
 
     Signals to the whole group are the parent's to handle; it kills its workers.
     """
@@ -404,10 +409,15 @@ def _work(connection: Connection, out: Path, teacher: Callable[[], Teacher]) -> 
     threading.Thread(target=_end_with_parent, daemon=True).start()
     try:
         simulator = teacher()
+        connection.send(("scene", None))
+        with suppress(SimulationError):
+            simulator.load(connection.recv())
+        accounted = 0.0
         connection.send(("shard", None))
         while (shard := connection.recv()) is not None:
             try:
-                _make_shard(out, shard, simulator, lambda status: connection.send(("trajectory", status)))
+                _make_shard(out, shard, simulator, accounted, lambda status: connection.send(("trajectory", status)))
+                accounted = simulator.compile_seconds
             except OSError as error:
                 why = os.strerror(error.errno) if error.errno else str(error)
                 connection.send(("error", f"{out / shard.name}: cannot be written: {why}; finished shards are kept"))
@@ -427,8 +437,11 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
-def _make_shard(out: Path, shard: Shard, simulator: Teacher, report: Callable[[str], None]) -> None:
-    """Run the trajectories of a shard, write the good ones, and write beside it what it cost and which failed."""
+def _make_shard(out: Path, shard: Shard, simulator: Teacher, accounted: float, report: Callable[[str], None]) -> None:
+    """Run the trajectories of a shard, write the good ones, and write beside it what it cost and which failed.
+
+    ``accounted``: compile seconds of this simulator that earlier shards have been charged with.
+    """
     trajectories, failed, seconds = {}, [], 0.0
     compiled = simulator.compile_seconds
     for index, scene in shard.scenes.items():
@@ -440,11 +453,11 @@ def _make_shard(out: Path, shard: Shard, simulator: Teacher, report: Callable[[s
         else:
             failed.append({"index": index, "seed": scene.seed, "status": trajectory.status})
         report(trajectory.status)
-    compile_seconds = simulator.compile_seconds - compiled
+    cost = {"wall_seconds": seconds - (simulator.compile_seconds - compiled), "compile_seconds": simulator.compile_seconds - accounted}
     if trajectories:
         write_shard(out / shard.name, trajectories)
     # Last, because a shard counts as finished only with its cost beside it.
-    write_json(out / shard.cost_name, {"wall_seconds": seconds - compile_seconds, "compile_seconds": compile_seconds, "failed": failed})
+    write_json(out / shard.cost_name, cost | {"failed": failed})
 
 
 class _Progress:

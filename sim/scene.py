@@ -144,12 +144,14 @@ class _Physics(_Strict):
             remedy = [max(4, round((upper - lower) / edges[0])) for lower, upper in self.bounds]
             raise _mistake("cells", self.cells, f"cells must be square (edges {[round(edge, 6) for edge in edges]}); try {remedy}")
         if self.radius < self.spacing:
-            raise _mistake("radius", self.radius, f"below the particle spacing {self.spacing:.6g}: no particle would have a neighbour; use at least {1.5 * self.spacing:.4g}")
+            remedy = f"below the particle spacing {self.spacing:.6g}: no particle would have a neighbour; use at least {1.5 * self.spacing:.4g}"
+            raise _mistake("radius", self.radius, remedy)
         if not self.materials:
             raise _mistake("materials", {}, "name at least one material")
         for name, material in self.materials.items():
             if self.dim == 3 and isinstance(material, Sand) and material.friction_angle > 36.9:
-                raise _mistake(f"materials.{name}.friction_angle", material.friction_angle, "a compression-matched Drucker-Prager cone cannot yield in triaxial extension above 36.9 degrees in 3D; use less")
+                remedy = "a compression-matched Drucker-Prager cone cannot yield in triaxial extension above 36.9 degrees in 3D; use less"
+                raise _mistake(f"materials.{name}.friction_angle", material.friction_angle, remedy)
         return self
 
 
@@ -180,13 +182,13 @@ class _FamilyModel(_Physics):
             for key, values in lists.items():
                 if values is not None and len(values) != self.dim:
                     raise _mistake(f"{where}.{key}", values, f"needs {self.dim} entries, one per axis")
-            for key, value in [*scalars.items(), *((f"{key}[{axis}]", value) for key, values in lists.items() for axis, value in enumerate(values or []))]:
+            entries = {f"{key}[{axis}]": value for key, values in lists.items() for axis, value in enumerate(values or [])}
+            for key, value in (scalars | entries).items():
                 low, high = value if isinstance(value, tuple) else (value, value)
                 if value is not None and low > high:
                     raise _mistake(f"{where}.{key}", value, "low must not exceed high")
-                if value is not None and key.startswith("shape") and low < self.spacing:
-                    if key != "shape.corners":
-                        raise _mistake(f"{where}.{key}", value, f"must be at least one particle spacing ({self.spacing:.6g})")
+                if value is not None and key.startswith("shape") and key != "shape.corners" and low < self.spacing:
+                    raise _mistake(f"{where}.{key}", value, f"must be at least one particle spacing ({self.spacing:.6g})")
         return self
 
 
@@ -341,7 +343,8 @@ class SceneFamily:
                 bodies.append(body)
             else:
                 return Scene(seed=seed, bodies=bodies, **shared)
-        raise InputError(self.where, reason[0], f"seed {seed}", f"{reason[1]} in each of {_TRIES} draws; make it smaller, move its center or allow fewer bodies")
+        remedy = f"{reason[1]} in each of {_TRIES} draws; make it smaller, move its center or allow fewer bodies"
+        raise InputError(self.where, reason[0], f"seed {seed}", remedy)
 
     def _place(self, family: BodyFamily, rng: np.random.Generator) -> Body:
         model, shape, spacing = self.model, family.shape, self.model.spacing
@@ -429,7 +432,8 @@ def read_yaml(path: str | Path) -> Any:
         return yaml.load(text, _UniqueKeyLoader)  # noqa: S506 (a SafeLoader)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         mark = getattr(error, "problem_mark", None)
-        raise InputError(path, f"line {mark.line + 1}" if mark else "file", getattr(error, "problem", None) or str(error), "not valid YAML; correct the line") from None
+        place, fault = f"line {mark.line + 1}" if mark else "file", getattr(error, "problem", None) or str(error)
+        raise InputError(path, place, fault, "not valid YAML; correct the line") from None
 
 
 def explain_validation(error: ValidationError, where: object) -> InputError:
@@ -438,7 +442,8 @@ def explain_validation(error: ValidationError, where: object) -> InputError:
     path, value, location = "", first["input"], first["loc"]
     for place, part in enumerate(location):
         # pydantic names the branch of a union after the key; that is not a key of the file.
-        branch = place > 0 and (location[place - 1] == "shape" or (place == 2 and location[0] == "materials") or str(part) in ("float", "str", "constrained-float") or "[" in str(part))
+        tagged = place > 0 and (location[place - 1] == "shape" or (place == 2 and location[0] == "materials"))
+        branch = tagged or (place > 0 and (str(part) in ("float", "str", "constrained-float") or "[" in str(part)))
         if isinstance(part, int):
             path += f"[{part}]"
         elif not branch:

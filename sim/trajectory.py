@@ -152,8 +152,10 @@ class ShardReader:
                 version = self._file.attrs.get("format_version")
             except OSError as error:
                 self._file = None
-                raise InputError(self.path, "file", str(error).split("(")[-1].rstrip(")"), "not a readable HDF5 file (truncated?); delete it and generate again") from None
-            _check(version is not None and int(version) == FORMAT_VERSION, self.path, "format_version", version, f"this version reads {FORMAT_VERSION}; generate the file again")
+                fault = str(error).split("(")[-1].rstrip(")")
+                raise InputError(self.path, "file", fault, "not a readable HDF5 file (truncated?); delete it and generate again") from None
+            remedy = f"this version reads {FORMAT_VERSION}; generate the file again"
+            _check(version is not None and int(version) == FORMAT_VERSION, self.path, "format_version", version, remedy)
         return self._file
 
     def close(self) -> None:
@@ -191,9 +193,14 @@ class ShardReader:
                 meta["scene"], meta["simulator"], str(meta["status"])
             except (KeyError, ValueError, TypeError, OSError) as error:
                 raise InputError(self.path, f"{index:06d}", str(error), "incomplete trajectory; delete the shard and generate again") from None
-            _check(isinstance(position, h5py.Dataset) and position.ndim == 3 and position.dtype == np.float32 and position.shape[2] in (2, 3), self.path, f"{index:06d}/position", getattr(position, "shape", None), "must be float32 [frames, particles, 2 or 3]")
-            _check(isinstance(kinds, h5py.Dataset) and kinds.shape == (position.shape[1],), self.path, f"{index:06d}/particle_type", getattr(kinds, "shape", None), "must have one entry per particle")
-            _check(bounds.shape == (position.shape[2], 2) and bool((bounds[:, 0] < bounds[:, 1]).all()), self.path, f"{index:06d}/bounds", meta["bounds"], "must be [dim][lower, upper] with lower < upper")
+            shape = getattr(position, "shape", None)
+            remedy = "must be float32 [frames, particles, 2 or 3]"
+            sound = isinstance(position, h5py.Dataset) and len(shape) == 3 and position.dtype == np.float32 and shape[2] in (2, 3)
+            _check(sound, self.path, f"{index:06d}/position", shape, remedy)
+            sound = isinstance(kinds, h5py.Dataset) and kinds.shape == (shape[1],)
+            _check(sound, self.path, f"{index:06d}/particle_type", getattr(kinds, "shape", None), "must have one entry per particle")
+            sound = bounds.shape == (shape[2], 2) and bool((bounds[:, 0] < bounds[:, 1]).all())
+            _check(sound, self.path, f"{index:06d}/bounds", meta["bounds"], "must be [dim][lower, upper] with lower < upper")
             _check(numbers[0] > 0 and numbers[1] > 0, self.path, f"{index:06d}/frame_step, radius", numbers[:2], "must be positive")
             self._meta[index] = meta
         return self._meta[index]

@@ -53,7 +53,7 @@ def hidden(folder):
 def run_here(out, shards, jobs, teacher, progress):
     simulator = teacher()
     for shard in shards:
-        sim.generate._make_shard(out, shard, simulator, progress.trajectory)
+        sim.generate._make_shard(out, shard, simulator, 0.0, progress.trajectory)
 
 
 @pytest.fixture

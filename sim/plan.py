@@ -1,0 +1,88 @@
+"""What a scene family will build and cost, before anything is built: kernels, fields, what is left out, memory, time, disk."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sim.generate import SPLITS, trajectory_seed
+from sim.scene import SceneFamily
+
+#: Particle-substeps per second of one core, by dimension and the slowest material present: the order of a 2-core cloud machine of
+#: 2023. ``make bench`` measures this machine's.
+RATES = {(2, "water"): 12e6, (2, "sand"): 6e6, (3, "water"): 4e6, (3, "sand"): 1.5e6}
+
+#: Scenes drawn to describe a family.
+_SAMPLES = 8
+
+
+@dataclass(frozen=True)
+class Plan:
+    """``solver``: ``MPMSimulator.plan`` of the largest of the drawn scenes; recorded and teacher particles (mean over the draws);
+    substeps a frame (at rest, at the speed of a fall through the box); particle-substeps a trajectory (mean of the two);
+    seconds a trajectory on one core at ``rate``; bytes a trajectory on disk."""
+
+    solver: dict
+    recorded: float
+    particles: float
+    substeps: tuple[int, int]
+    particle_substeps: float
+    rate: float
+    seconds: float
+    disk: float
+
+
+def plan(family: SceneFamily) -> Plan:
+    """Draw a few scenes and ask the solver what it would build. Raises ``InputError``; allocates and compiles nothing."""
+    from sim.mpm.solver import MPMSimulator
+
+    solver, model = MPMSimulator(), family.model
+    plans = [solver.plan(family.sample(trajectory_seed(0, "train", index))) for index in range(_SAMPLES)]
+    recorded, particles = (float(np.mean([each[key] for each in plans])) for key in ("recorded", "particles"))
+    substeps = np.mean([each["substeps_per_frame"] for each in plans], axis=0)
+    work = particles * float(substeps.mean()) * (model.frames - 1)
+    rate = min(RATES[model.dim, material] for material in plans[0]["materials"])
+    return Plan(
+        solver=max(plans, key=lambda each: each["bytes"]), recorded=recorded, particles=particles, substeps=(round(substeps[0]), round(substeps[1])),
+        particle_substeps=work, rate=rate, seconds=work / rate, disk=4.0 * model.frames * recorded * model.dim,
+    )
+
+
+def _duration(seconds: float) -> str:
+    for unit, length in (("h", 3600), ("min", 60)):
+        if seconds >= length:
+            return f"{seconds / length:.1f} {unit}"
+    return f"{seconds:.1f} s"
+
+
+def _size(count: float) -> str:
+    for unit, length in (("GB", 1e9), ("MB", 1e6)):
+        if count >= length:
+            return f"{count / length:.1f} {unit}"
+    return f"{count / 1e3:.1f} kB"
+
+
+def plan_text(family: SceneFamily, jobs: int = 1) -> str:
+    """The plan for people, with the time and disk that the family's splits need in ``jobs`` processes."""
+    found, model = plan(family), family.model
+    solver = found.solver
+    lines = [
+        f"scene {model.name}: MLS-MPM, {solver['dim']}D, {', '.join(solver['materials'])}, {solver['walls']} walls",
+        f"  particles: {found.recorded:.0f} recorded, {found.particles:.0f} simulated (mean of {_SAMPLES} draws); "
+        f"{' x '.join(map(str, solver['cells']))} cells of {solver['grid_spacing']:.4g}",
+        f"  compiled: {', '.join(solver['kernels'])}",
+        f"  allocated: {_size(solver['bytes'])}",
+        *(f"    {name}: {entries} x {size} bytes" for name, (size, entries) in solver["fields"].items()),
+        "  left out:",
+        *(f"    {name}: {reason}" for name, reason in solver["left_out"].items()),
+        f"  substeps a frame: {found.substeps[0]} at rest, {found.substeps[1]} at the speed of a fall through the box "
+        f"(wave speed {solver['wave_speed']:.3g} m/s)",
+        f"  cost of a trajectory: {found.particle_substeps / 1e6:.1f} million particle-substeps, about {_duration(found.seconds)} "
+        f"on one core at {found.rate / 1e6:g} million a second; {_size(found.disk)} on disk",
+    ]
+    for split in SPLITS:
+        count = getattr(model.splits, split)
+        duration = _duration(count * found.seconds / min(jobs, max(count, 1)))
+        lines.append(f"  {split}: {count} trajectories, about {duration} with --jobs {jobs}, {_size(count * found.disk)}")
+    return "\n".join(lines)
