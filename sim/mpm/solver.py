@@ -27,261 +27,305 @@ COURANT_GROWTH = 1.5
 MAX_HALVINGS = 6
 
 
+#: Distance from a wall, in cells, at which particles are stopped.
+HAIR = 1e-4
+#: What a frame adds up: kinetic, potential, elastic energy; the largest of squared speed, wave speed, squared speed within the frame.
+SUMS = 6
+
+
 def _power_of_two(n: int) -> int:
     return 1 << max(int(n) - 1, 15).bit_length()
 
 
 @ti.data_oriented
 class _Kernels:
-    """Fields and compiled code for one structure: dimension, materials present, wall kind; capacities in particles and nodes."""
+    """Fields and compiled code for one structure: dimension, materials present, wall kind; capacities in particles and nodes.
 
-    def __init__(self, dim: int, models: tuple[str, ...], friction: str, capacity: int, nodes: tuple[int, ...], serial: bool):
+    Vectors that meet in the transfers have four equal lanes whatever the dimension: a node is (momentum, mass, 0), later (velocity, 1, 0);
+    a particle's velocity carries the gathered 1 along. Uniform lanes are what the compiler turns into vector instructions; shorter
+    vectors became shuffles and ran at 0.6 of the speed. The unit vectors ``E`` are data, lest constant folding break the lanes up; so are
+    all numbers, since a vector among a kernel's arguments costs 90 us a launch.
+    Positions are stored in cells, from the padded corner.
+    """
+
+    def __init__(self, dim: int, models: tuple, friction: str, capacity: int, nodes: tuple[int, ...], serial: bool):
         self.dim, self.models, self.friction, self.capacity, self.nodes = dim, models, friction, capacity, nodes
         self.x = ti.Vector.field(dim, ti.f32, capacity)
-        self.v = ti.Vector.field(dim, ti.f32, capacity)
-        self.C = ti.Matrix.field(dim, dim, ti.f32, capacity)
-        self.materials = [MODELS[model](dim, capacity) for model in models]
-        self.grid = ti.Vector.field(dim + 1, ti.f32, nodes)  # momentum, then velocity; mass last
+        self.v = ti.Vector.field(4, ti.f32, capacity)
+        self.C = [ti.Vector.field(4, ti.f32, capacity) for _ in range(dim)]  # column a: derivative of the velocity along axis a
+        self.materials = [MODELS[model](dim, capacity, *options) for model, *options in models]
+        self.grid = ti.Vector.field(4, ti.f32, nodes)
         self.range = ti.field(ti.i32, len(models) + 1)  # particles of material m: range[m] .. range[m + 1]
         self.mass_volume = ti.Vector.field(2, ti.f32, len(models))
         self.extent = ti.Vector.field(dim, ti.i32, 2)  # node indices of the walls
-        self.limits = ti.Vector.field(dim, ti.f32, 2)  # walls in grid coordinates, in cells
-        self.fastest = ti.field(ti.f32, ())
-        self.state = [self.x, self.v, self.C, *(field for material in self.materials for field in material.fields())]
-        self.saved = [
-            ti.field(ti.f32, capacity) if isinstance(field, ti.ScalarField) else ti.Matrix.field(field.n, field.m, ti.f32, capacity)
-            if field.m > 1 else ti.Vector.field(field.n, ti.f32, capacity) for field in self.state
-        ]
+        self.dx, self.coefficient = ti.field(ti.f32, ()), ti.field(ti.f32, ())
+        self.lower, self.gravity = ti.Vector.field(dim, ti.f32, ()), ti.Vector.field(dim, ti.f32, ())
+        self.E = ti.Vector.field(4, ti.f32, 3)
+        self.E.from_numpy(np.eye(3, 4, dtype=np.float32))
+        self.state = [self.x, self.v, *self.C, *(field for material in self.materials for field in material.fields())]
+        self.saved = [ti.field(ti.f32, capacity) if isinstance(field, ti.ScalarField) else ti.Vector.field(field.n, ti.f32, capacity) for field in self.state]
         self.frame = self.frame_serial if serial else self.frame_parallel
 
-    def field_names(self) -> list[str]:
-        """Per-particle and per-node fields, as ``plan`` lists them."""
-        return ["x", "v", "C", *(f"{model}.{name}" for model in self.models for name in MODELS[model].state), "grid"]
-
-    # x is stored in cells, from the padded corner; velocities in length per second.
     @ti.func
-    def weights(self, fx):
-        """Quadratic B-spline weights of the three nodes along each axis; fx in [0.5, 1.5)."""
-        return ti.Matrix.rows([0.5 * (1.5 - fx) ** 2, 0.75 - (fx - 1.0) ** 2, 0.5 * (fx - 0.5) ** 2])
-
-    @ti.func
-    def clear_node(self, I):
-        self.grid[I] = ti.Vector.zero(ti.f32, self.dim + 1)
-
-    @ti.func
-    def p2g(self, m: ti.template(), p, dt, dx):
-        """Particle to grid: m_i += w m, (mv)_i += w [m v + (m C - dt V0 4 / dx^2 tau)(x_i - x_p)] (Hu et al. 2018, eq. 29)."""
-        tau = self.materials[m].kirchhoff(p, dt * self.C[p])
-        mass, volume = self.mass_volume[m][0], self.mass_volume[m][1]
-        affine = (mass * dx) * self.C[p] - (dt * volume * 4.0 / dx) * tau
-        x = self.x[p]
+    def locate(self, x):
+        """First of the three nodes along each axis, and the distance to it in cells, in [0.5, 1.5)."""
         base = ti.cast(x - 0.5, ti.i32)
-        fx = x - ti.cast(base, ti.f32)
-        w = self.weights(fx)
-        momentum = mass * self.v[p] - affine @ fx
+        return base, x - ti.cast(base, ti.f32)
+
+    @ti.func
+    def weights(self, f):
+        """Quadratic B-spline weights of three nodes."""
+        return ti.Vector([0.5 * (1.5 - f) ** 2, 0.75 - (f - 1.0) ** 2, 0.5 * (f - 0.5) ** 2])
+
+    @ti.func
+    def p2g(self, m: ti.template(), p, base, fx, dt):
+        """Particle to grid: m_i += w m, (mv)_i += w [m v + (m C - dt V0 4 / dx^2 tau)(x_i - x_p)] (Hu et al. 2018, eq. 29)."""
+        mass, volume, dx = self.mass_volume[m][0], self.mass_volume[m][1], self.dx[None]
+        E0, E1, E2 = self.E[0], self.E[1], self.E[2]
+        factor = -4.0 * dt * volume / dx
         if ti.static(self.dim == 2):
-            for i, j in ti.static(ti.ndrange(3, 3)):
-                self.scatter(base + ti.Vector([i, j]), w[i, 0] * w[j, 1], momentum + affine @ ti.Vector([float(i), float(j)]), mass)
+            G = ti.Matrix.cols([ti.Vector([self.C[0][p][0], self.C[0][p][1]]), ti.Vector([self.C[1][p][0], self.C[1][p][1]])])
+            tau = factor * self.materials[m].kirchhoff(p, dt * G)
+            P0 = (mass * dx) * self.C[0][p] + tau[0, 0] * E0 + tau[1, 0] * E1
+            P1 = (mass * dx) * self.C[1][p] + tau[0, 1] * E0 + tau[1, 1] * E1
+            Q = mass * self.v[p] - fx[0] * P0 - fx[1] * P1
+            wx, wy = self.weights(fx[0]), self.weights(fx[1])
+            for i in ti.static(range(3)):
+                R, T = wx[i] * (Q + float(i) * P0), wx[i] * P1
+                for j in ti.static(range(3)):
+                    self.grid[base[0] + i, base[1] + j] += wy[j] * (R + float(j) * T)
         else:
+            G = ti.Matrix.cols([ti.Vector([self.C[a][p][0], self.C[a][p][1], self.C[a][p][2]]) for a in ti.static(range(3))])
+            tau = factor * self.materials[m].kirchhoff(p, dt * G)
+            P0 = (mass * dx) * self.C[0][p] + tau[0, 0] * E0 + tau[1, 0] * E1 + tau[2, 0] * E2
+            P1 = (mass * dx) * self.C[1][p] + tau[0, 1] * E0 + tau[1, 1] * E1 + tau[2, 1] * E2
+            P2 = (mass * dx) * self.C[2][p] + tau[0, 2] * E0 + tau[1, 2] * E1 + tau[2, 2] * E2
+            Q = mass * self.v[p] - fx[0] * P0 - fx[1] * P1 - fx[2] * P2
+            wx, wy, wz = self.weights(fx[0]), self.weights(fx[1]), self.weights(fx[2])
+            # Rolled along two axes: fully unrolled, 27 nodes take half a minute to compile.
             for i in range(3):
                 for j in range(3):
-                    wij = w[i, 0] * w[j, 1]
-                    row = momentum + affine @ ti.Vector([float(i), float(j), 0.0])
+                    wij = wx[i] * wy[j]
+                    R, T = wij * (Q + float(i) * P0 + float(j) * P1), wij * P2
                     for k in ti.static(range(3)):
-                        self.scatter(base + ti.Vector([i, j, k]), wij * w[k, 2], row + affine @ ti.Vector([0.0, 0.0, float(k)]), mass)
+                        self.grid[base[0] + i, base[1] + j, base[2] + k] += wz[k] * (R + float(k) * T)
 
     @ti.func
-    def scatter(self, node, weight, momentum, mass):
-        value = ti.Vector.zero(ti.f32, self.dim + 1)
-        for d in ti.static(range(self.dim)):
-            value[d] = weight * momentum[d]
-        value[self.dim] = weight * mass
-        self.grid[node] += value
-
-    @ti.func
-    def update_node(self, I, dt, gravity, coefficient):
+    def update_node(self, I, dt):
         """Momentum to velocity, gravity, walls."""
         cell = self.grid[I]
-        mass = cell[self.dim]
-        if mass > 0.0:
+        if cell[self.dim] > 0.0:
+            inverse = 1.0 / cell[self.dim]
             v = ti.Vector.zero(ti.f32, self.dim)
             for d in ti.static(range(self.dim)):
-                v[d] = cell[d] / mass + dt * gravity[d]
+                v[d] = cell[d] * inverse + dt * self.gravity[None][d]
             # A name of its own: reassigning v from a function inside a branch is stored with its old value (Taichi 1.7.4).
-            u = wall(v, I, self.extent[0], self.extent[1], self.friction, coefficient)
+            u = wall(v, I, self.extent[0], self.extent[1], self.friction, self.coefficient[None])
             for d in ti.static(range(self.dim)):
                 cell[d] = u[d]
+            cell[self.dim] = 1.0
             self.grid[I] = cell
 
     @ti.func
-    def extrapolate(self, axis: ti.template(), I):
-        """Ghost nodes behind both walls of an axis: v(-1) = 2 v(0) - v(1).
+    def extrapolate(self, axis: ti.template(), side: ti.template(), I):
+        """Ghost node behind a wall: v(-1) = 2 v(0) - v(1). ``I`` names the line; its entry along ``axis`` is not used.
 
         Any linear velocity field is then interpolated exactly up to the wall: nothing creeps into it, and tr C is the true
-        compression there. With held nodes in place of ghosts, C underrates the compression in the last half cell and water
-        piles up on the floor at reference density (more than half of a drop's particles did).
+        compression there. With held nodes in place of ghosts, C underrates the compression in the last half cell, and particles
+        gather on the floor at reference density.
         """
-        for side in ti.static(range(2)):
-            ghost = ti.Vector([I[d] for d in ti.static(range(self.dim))])
-            held = ti.Vector([I[d] for d in ti.static(range(self.dim))])
-            inner = ti.Vector([I[d] for d in ti.static(range(self.dim))])
-            ghost[axis] = self.extent[side][axis] + ti.static(2 * side - 1)
-            held[axis] = self.extent[side][axis]
-            inner[axis] = self.extent[side][axis] - ti.static(2 * side - 1)
-            known = self.grid[inner][self.dim] > 0.0
-            for d in ti.static(range(self.dim)):
-                v = self.grid[held][d]
-                if known:
-                    v = 2.0 * v - self.grid[inner][d]
-                self.grid[ghost][d] = v
-            # Corners: the next axis must see this line as known.
-            self.grid[ghost][self.dim] = self.grid[held][self.dim]
+        at = self.extent[side][axis]
+        inward = ti.static(1 - 2 * side)
+        ghost = ti.Vector([(at - inward if d == axis else I[d]) for d in ti.static(range(self.dim))])
+        held = ti.Vector([(at if d == axis else I[d]) for d in ti.static(range(self.dim))])
+        inner = ti.Vector([(at + inward if d == axis else I[d]) for d in ti.static(range(self.dim))])
+        value = self.grid[held]
+        if self.grid[inner][self.dim] > 0.0:
+            value = 2.0 * self.grid[held] - self.grid[inner]
+        self.grid[ghost] = value
 
     @ti.func
-    def gather(self, node):
-        cell = self.grid[node]
-        v = ti.Vector.zero(ti.f32, self.dim)
-        for d in ti.static(range(self.dim)):
-            v[d] = cell[d]
-        return v
+    def g2p(self, p, dt):
+        """Grid to particle: v = sum w v_i, C = 4 / dx^2 sum w v_i (x_i - x_p)^T, x += dt v; a wall stops what would cross it.
 
-    @ti.func
-    def g2p(self, p, dt, dx):
-        """Grid to particle: v = sum w v_i, C = 4 / dx^2 sum w v_i (x_i - x_p)^T, x += dt v; a wall stops what would cross it."""
-        x = self.x[p]
-        base = ti.cast(x - 0.5, ti.i32)
-        fx = x - ti.cast(base, ti.f32)
-        w = self.weights(fx)
-        v = ti.Vector.zero(ti.f32, self.dim)
-        C = ti.Matrix.zero(ti.f32, self.dim, self.dim)
+        Returns the squared speed.
+        """
+        x, dx = self.x[p], self.dx[None]
+        base, fx = self.locate(x)
+        v = ti.Vector.zero(ti.f32, 4)
+        k = 4.0 / dx
         if ti.static(self.dim == 2):
-            for i, j in ti.static(ti.ndrange(3, 3)):
-                wv = w[i, 0] * w[j, 1] * self.gather(base + ti.Vector([i, j]))
-                v += wv
-                C += wv.outer_product(ti.Vector([float(i), float(j)]))
+            wx, wy = self.weights(fx[0]), self.weights(fx[1])
+            c0, c1 = ti.Vector.zero(ti.f32, 4), ti.Vector.zero(ti.f32, 4)
+            for i in ti.static(range(3)):
+                low = wy[0] * self.grid[base[0] + i, base[1]]
+                high = wy[2] * self.grid[base[0] + i, base[1] + 2]
+                S = low + wy[1] * self.grid[base[0] + i, base[1] + 1] + high
+                v += wx[i] * S
+                c1 += wx[i] * (high - low)
+                if ti.static(i != 1):
+                    c0 += (float(i - 1) * wx[i]) * S
+            self.C[0][p], self.C[1][p] = k * (c0 + (1.0 - fx[0]) * v), k * (c1 + (1.0 - fx[1]) * v)
         else:
+            wx, wy, wz = self.weights(fx[0]), self.weights(fx[1]), self.weights(fx[2])
+            c0, c1, c2 = ti.Vector.zero(ti.f32, 4), ti.Vector.zero(ti.f32, 4), ti.Vector.zero(ti.f32, 4)
             for i in range(3):
                 for j in range(3):
-                    wij = w[i, 0] * w[j, 1]
-                    row = ti.Vector.zero(ti.f32, 3)
-                    last = ti.Vector.zero(ti.f32, 3)
-                    for k in ti.static(range(3)):
-                        wv = wij * w[k, 2] * self.gather(base + ti.Vector([i, j, k]))
-                        row += wv
-                        last += float(k) * wv
-                    v += row
-                    C += row.outer_product(ti.Vector([float(i), float(j), 0.0])) + last.outer_product(ti.Vector([0.0, 0.0, 1.0]))
-        C = (4.0 / dx) * (C - v.outer_product(fx))
-        x += (dt / dx) * v
+                    wij = wx[i] * wy[j]
+                    low = wz[0] * self.grid[base[0] + i, base[1] + j, base[2]]
+                    high = wz[2] * self.grid[base[0] + i, base[1] + j, base[2] + 2]
+                    S = wij * (low + wz[1] * self.grid[base[0] + i, base[1] + j, base[2] + 1] + high)
+                    v += S
+                    c0 += float(i - 1) * S
+                    c1 += float(j - 1) * S
+                    c2 += wij * (high - low)
+            self.C[0][p] = k * (c0 + (1.0 - fx[0]) * v)
+            self.C[1][p] = k * (c1 + (1.0 - fx[1]) * v)
+            self.C[2][p] = k * (c2 + (1.0 - fx[2]) * v)
+        # Keep particles a hair inside, so that what is recorded is inside in float32 too.
+        speed2 = 0.0
         for d in ti.static(range(self.dim)):
-            inside = ti.min(ti.max(x[d], self.limits[0][d]), self.limits[1][d])
-            if inside != x[d]:
+            moved = x[d] + (dt / dx) * v[d]
+            speed2 += v[d] * v[d]
+            inside = ti.min(ti.max(moved, ti.cast(self.extent[0][d], ti.f32) + HAIR), ti.cast(self.extent[1][d], ti.f32) - HAIR)
+            if inside != moved:
                 v[d] = 0.0
             x[d] = inside
-        self.x[p], self.v[p], self.C[p] = x, v, C
-        ti.atomic_max(self.fastest[None], v.norm_sqr())
+        self.x[p], self.v[p] = x, v
+        return speed2
 
     @ti.func
-    def report(self, m: ti.template(), p, dx, out: ti.template()):
-        """Position (in cells), velocity, elastic energy per volume, wave speed of one particle."""
+    def report(self, m: ti.template(), p, position: ti.template(), sums: ti.template()):
+        """Position of one particle [length], and its part in the sums (see ``SUMS``). Sums, unlike maxima, carry a NaN to the host."""
+        mass, volume = self.mass_volume[m][0], self.mass_volume[m][1]
+        speed2, height = 0.0, 0.0
         for d in ti.static(range(self.dim)):
-            out[p, d] = self.x[p][d]
-            out[p, self.dim + d] = self.v[p][d]
-        out[p, 2 * self.dim] = self.materials[m].energy_density(p)
-        out[p, 2 * self.dim + 1] = self.materials[m].wave_speed(p)
+            x = self.lower[None][d] + (self.x[p][d] - WALL) * self.dx[None]
+            position[p, d] = x
+            speed2 += self.v[p][d] ** 2
+            height -= self.gravity[None][d] * x
+        sums[0] += ti.cast(0.5 * mass * speed2, ti.f64)
+        sums[1] += ti.cast(mass * height, ti.f64)
+        sums[2] += ti.cast(volume * self.materials[m].energy_density(p), ti.f64)
+        ti.atomic_max(sums[3], ti.cast(speed2, ti.f64))
+        ti.atomic_max(sums[4], ti.cast(self.materials[m].wave_speed(p), ti.f64))
 
     @ti.kernel
-    def frame_serial(self, substeps: ti.i32, dt: ti.f32, dx: ti.f32, gravity: ti.types.vector(3, ti.f32), coefficient: ti.f32, out: ti.types.ndarray(ti.f32, 2)):  # noqa: E501
+    def frame_serial(
+        self, substeps: ti.i32, dt: ti.f32, keep: ti.i32, position: ti.types.ndarray(ti.f32, 2), sums: ti.types.ndarray(ti.f64, 1)
+    ):
+        """A whole frame; ``keep`` saves the state first. Only the box of nodes that particles touch is swept."""
         ti.loop_config(serialize=True)
-        for s in range(substeps + 1):
-            if s < substeps:
-                if ti.static(self.dim == 2):
-                    for i in range(self.extent[1][0] + 2):
-                        for j in range(self.extent[1][1] + 2):
-                            self.clear_node(ti.Vector([i, j]))
-                else:
-                    for i in range(self.extent[1][0] + 2):
-                        for j in range(self.extent[1][1] + 2):
-                            for k in range(self.extent[1][2] + 2):
-                                self.clear_node(ti.Vector([i, j, k]))
-                for m in ti.static(range(len(self.models))):
-                    for p in range(self.range[m], self.range[m + 1]):
-                        self.p2g(m, p, dt, dx)
-                if ti.static(self.dim == 2):
-                    for i in range(self.extent[1][0] + 2):
-                        for j in range(self.extent[1][1] + 2):
-                            self.update_node(ti.Vector([i, j]), dt, gravity, coefficient)
-                else:
-                    for i in range(self.extent[1][0] + 2):
-                        for j in range(self.extent[1][1] + 2):
-                            for k in range(self.extent[1][2] + 2):
-                                self.update_node(ti.Vector([i, j, k]), dt, gravity, coefficient)
-                for axis in ti.static(range(self.dim)):
-                    if ti.static(self.dim == 2):
-                        for i in range(self.extent[1][1 - axis] + 2):
-                            self.extrapolate(axis, ti.Vector([i, i]))
-                    else:
-                        for i in range(self.extent[1][(axis + 1) % 3] + 2):
-                            for j in range(self.extent[1][(axis + 2) % 3] + 2):
-                                I = ti.Vector([0, 0, 0])
-                                I[(axis + 1) % 3], I[(axis + 2) % 3] = i, j
-                                self.extrapolate(axis, I)
-                for p in range(self.range[ti.static(len(self.models))]):
-                    self.g2p(p, dt, dx)
+        for p in range(keep * self.range[ti.static(len(self.models))]):
+            self.save_particle(p)
+        ti.loop_config(serialize=True)
+        for s in range(substeps):
+            low, high = ti.Vector([1 << 20] * self.dim), ti.Vector([0] * self.dim)
+            for m in ti.static(range(len(self.models))):
+                for p in range(self.range[m], self.range[m + 1]):
+                    base, fx = self.locate(self.x[p])
+                    low, high = ti.min(low, base), ti.max(high, base)
+                    self.p2g(m, p, base, fx, dt)
+            if ti.static(self.dim == 2):
+                for i in range(low[0], high[0] + 3):
+                    for j in range(low[1], high[1] + 3):
+                        self.update_node(ti.Vector([i, j]), dt)
             else:
-                for m in ti.static(range(len(self.models))):
-                    for p in range(self.range[m], self.range[m + 1]):
-                        self.report(m, p, dx, out)
+                for i in range(low[0], high[0] + 3):
+                    for j in range(low[1], high[1] + 3):
+                        for k in range(low[2], high[2] + 3):
+                            self.update_node(ti.Vector([i, j, k]), dt)
+            for axis, side in ti.static(ti.ndrange(self.dim, 2)):
+                touched = low[axis] < WALL if ti.static(side == 0) else high[axis] + 2 > self.extent[1][axis]
+                if touched:
+                    if ti.static(self.dim == 2):
+                        for i in range(low[1 - axis], high[1 - axis] + 3):
+                            self.extrapolate(axis, side, ti.Vector([i, i]))
+                    else:
+                        for i in range(low[(axis + 1) % 3], high[(axis + 1) % 3] + 3):
+                            for j in range(low[(axis + 2) % 3], high[(axis + 2) % 3] + 3):
+                                self.extrapolate(axis, side, ti.Vector([(0 if d == axis else i if d == (axis + 1) % 3 else j) for d in ti.static(range(3))]))
+            fastest = 0.0
+            for p in range(self.range[ti.static(len(self.models))]):
+                fastest = ti.max(fastest, self.g2p(p, dt))
+            sums[5] = ti.max(sums[5], ti.cast(fastest, ti.f64))
+            if ti.static(self.dim == 2):
+                for i in range(low[0], high[0] + 3):
+                    for j in range(low[1], high[1] + 3):
+                        self.grid[i, j] = ti.Vector.zero(ti.f32, 4)
+            else:
+                for i in range(low[0], high[0] + 3):
+                    for j in range(low[1], high[1] + 3):
+                        for k in range(low[2], high[2] + 3):
+                            self.grid[i, j, k] = ti.Vector.zero(ti.f32, 4)
+        for m in ti.static(range(len(self.models))):
+            ti.loop_config(serialize=True)
+            for p in range(self.range[m], self.range[m + 1]):
+                self.report(m, p, position, sums)
 
-    def frame_parallel(self, substeps: int, dt: float, dx: float, gravity, coefficient: float, out: np.ndarray) -> None:
+    def frame_parallel(self, substeps, dt, keep, position, sums) -> None:
+        """The same, one kernel a substep, all loops parallel (for a GPU)."""
+        if keep:
+            self.save()
         for _ in range(substeps):
-            self.substep_parallel(dt, dx, gravity, coefficient)
-        self.report_parallel(dx, out)
+            self.substep_parallel(dt, sums)
+        self.report_parallel(position, sums)
 
     @ti.kernel
-    def substep_parallel(self, dt: ti.f32, dx: ti.f32, gravity: ti.types.vector(3, ti.f32), coefficient: ti.f32):
-        for I in ti.grouped(self.grid):
-            self.clear_node(I)
+    def substep_parallel(self, dt: ti.f32, sums: ti.types.ndarray(ti.f64, 1)):
         for m in ti.static(range(len(self.models))):
             for p in range(self.range[m], self.range[m + 1]):
-                self.p2g(m, p, dt, dx)
+                base, fx = self.locate(self.x[p])
+                self.p2g(m, p, base, fx, dt)
         for I in ti.grouped(self.grid):
-            self.update_node(I, dt, gravity, coefficient)
-        for I in ti.grouped(self.grid):
-            for axis in ti.static(range(self.dim)):
+            self.update_node(I, dt)
+        for axis, side in ti.static(ti.ndrange(self.dim, 2)):
+            for I in ti.grouped(self.grid):
                 if I[axis] == 0:
-                    self.extrapolate(axis, I)
+                    self.extrapolate(axis, side, I)
         for p in range(self.range[ti.static(len(self.models))]):
-            self.g2p(p, dt, dx)
+            ti.atomic_max(sums[5], ti.cast(self.g2p(p, dt), ti.f64))
+        for I in ti.grouped(self.grid):
+            self.grid[I] = ti.Vector.zero(ti.f32, 4)
 
     @ti.kernel
-    def report_parallel(self, dx: ti.f32, out: ti.types.ndarray(ti.f32, 2)):
+    def report_parallel(self, position: ti.types.ndarray(ti.f32, 2), sums: ti.types.ndarray(ti.f64, 1)):
         for m in ti.static(range(len(self.models))):
             for p in range(self.range[m], self.range[m + 1]):
-                self.report(m, p, dx, out)
+                self.report(m, p, position, sums)
 
     @ti.kernel
     def load(self, data: ti.types.ndarray(ti.f32, 2)):
         """Positions and velocities from [n, 2 dim]; stress-free, no affine velocity."""
         for m in ti.static(range(len(self.models))):
             for p in range(self.range[m], self.range[m + 1]):
+                self.v[p] = ti.Vector.zero(ti.f32, 4)
                 for d in ti.static(range(self.dim)):
                     self.x[p][d] = data[p, d]
                     self.v[p][d] = data[p, self.dim + d]
-                self.C[p] = ti.Matrix.zero(ti.f32, self.dim, self.dim)
+                    self.C[d][p] = ti.Vector.zero(ti.f32, 4)
+                self.v[p][self.dim] = 1.0
                 self.materials[m].reset(p)
+        for I in ti.grouped(self.grid):
+            self.grid[I] = ti.Vector.zero(ti.f32, 4)
+
+    @ti.func
+    def save_particle(self, p):
+        for f in ti.static(range(len(self.state))):
+            self.saved[f][p] = self.state[f][p]
 
     @ti.kernel
     def save(self):
         for p in range(self.range[ti.static(len(self.models))]):
-            for f in ti.static(range(len(self.state))):
-                self.saved[f][p] = self.state[f][p]
+            self.save_particle(p)
 
     @ti.kernel
     def restore(self):
         for p in range(self.range[ti.static(len(self.models))]):
             for f in ti.static(range(len(self.state))):
                 self.state[f][p] = self.saved[f][p]
+        for I in ti.grouped(self.grid):
+            self.grid[I] = ti.Vector.zero(ti.f32, 4)
 
 
 class MPMSimulator:
@@ -311,68 +355,103 @@ class MPMSimulator:
         """Set the state of frame 0; allocates and compiles on first use of a structure (``compile_seconds``)."""
         begun = time.perf_counter()
         serial = (start_taichi() == "cpu") if self.serial is None else self.serial
-        refine = scene.refine if self.settings["particles"] == "teacher" else 1
-        particles = scene.particles(refine)
-        lower, upper = np.array(scene.bounds).T
-        cells = np.maximum(np.rint(np.array(scene.cells) * refine / self.settings["coarsen"]).astype(int), 4)
-        self.dx = float((upper[0] - lower[0]) / cells[0])
-        # A coarser grid whose cells do not divide every edge alike is refused rather than stretched.
-        if np.abs((upper - lower) / cells - self.dx).max() > 1e-6 * self.dx:
-            raise InputError(scene.name, "coarsen", self.settings["coarsen"], f"does not divide the box {scene.cells} evenly")
-        models = tuple(material.model for material in scene.materials.values())
-        friction = scene.walls.friction
-        structure = (scene.dim, models, "sticky" if friction == "sticky" else "coulomb" if friction > 0 else "slip")
+        particles = scene.particles(self._refine(scene))
+        structure, nodes = self._structure(scene), tuple(int(c) + 2 * WALL + 1 for c in self._cells(scene))
         capacity = _power_of_two(len(particles.position))
-        nodes = tuple(int(c) + 2 * WALL + 1 for c in cells)
-        old = self._kernels
+        old, fresh = self._kernels, False
         if old is None or (old.dim, old.models, old.friction) != structure or old.nodes != nodes or old.capacity < capacity:
-            self._kernels = _Kernels(*structure, capacity, nodes, serial)
-        kernels = self._kernels
-        self._scene, self._lower, self._n = scene, lower, len(particles.position)
-        self._tracked = particles.tracked
-        volume = particles.spacing**scene.dim
-        kernels.range.from_numpy(np.searchsorted(particles.material, np.arange(len(models) + 1)).astype(np.int32))
+            self._kernels, fresh = _Kernels(*structure, capacity, nodes, serial), True
+        kernels, dim, n = self._kernels, scene.dim, len(particles.position)
+        lower, upper = np.array(scene.bounds).T
+        cells = self._cells(scene)
+        self.dx = float((upper[0] - lower[0]) / cells[0])
+        self._scene, self._tracked = scene, particles.tracked
+        volume = particles.spacing**dim
+        kernels.range.from_numpy(np.searchsorted(particles.material, np.arange(len(scene.materials) + 1)).astype(np.int32))
         kernels.mass_volume.from_numpy(np.array([[material.density * volume, volume] for material in scene.materials.values()], np.float32))
-        self._masses = np.array([material.density * volume for material in scene.materials.values()])[particles.material]
-        self._volume = volume
-        kernels.extent.from_numpy(np.stack([np.full(scene.dim, WALL), WALL + cells]).astype(np.int32))
-        # Keep particles a hair inside, so that what is recorded is inside in float32 too.
-        hair = 1e-4
-        kernels.limits.from_numpy(np.stack([np.full(scene.dim, WALL + hair), WALL + cells - hair]).astype(np.float32))
+        kernels.extent.from_numpy(np.stack([np.full(dim, WALL), WALL + cells]).astype(np.int32))
         for model, material in zip(kernels.materials, scene.materials.values(), strict=True):
             model.configure(material, self.settings["stiffness"])
         position = particles.position
         if self.settings["perturbation"]:
             position = position + np.random.default_rng(np.random.SeedSequence([scene.seed, 2])).normal(size=position.shape) * self.settings["perturbation"]
-        start = np.concatenate([(position - lower) / self.dx + WALL, particles.velocity], 1).astype(np.float32)
-        kernels.load(np.ascontiguousarray(start))
-        self._gravity = ti.Vector([*scene.gravity, 0.0][:3], ti.f32)
-        self._coefficient = 0.0 if friction == "sticky" else float(friction)
+        # Where a wall stops particles during the run, it also holds the start.
+        cell = np.clip((position - lower) / self.dx + WALL, WALL + HAIR, WALL + cells - HAIR)
+        kernels.load(np.ascontiguousarray(np.concatenate([cell, particles.velocity], 1).astype(np.float32)))
+        friction = scene.walls.friction
+        kernels.dx[None], kernels.coefficient[None] = self.dx, 0.0 if friction == "sticky" else friction
+        kernels.lower[None], kernels.gravity[None] = lower.tolist(), list(scene.gravity)
         self._cfl = self.settings["cfl"] or scene.cfl
-        self._out = np.zeros((self._n, 2 * scene.dim + 2), np.float32)
-        kernels.fastest[None] = 0.0
-        kernels.save()
-        self._run(0, 0.0)
-        self._diagnose(0, float("inf"))
-        self.compile_seconds += time.perf_counter() - begun
+        self._position = np.zeros((n, dim), np.float32)
+        self._run(0, 0.0, keep=True)
+        if fresh:
+            kernels.restore()
+            self.compile_seconds += time.perf_counter() - begun
 
-    def _run(self, substeps: int, dt: float) -> None:
-        self._kernels.frame(substeps, dt, self.dx, self._gravity, self._coefficient, self._out)
+    def _refine(self, scene: Scene) -> int:
+        return scene.refine if self.settings["particles"] == "teacher" else 1
 
-    def _diagnose(self, substeps: int, dt: float) -> None:
-        dim, out = self._scene.dim, self._out.astype(np.float64)
-        position = (out[:, :dim] - WALL) * self.dx + self._lower
-        speed2 = (out[:, dim : 2 * dim] ** 2).sum(1)
-        self._position = position
-        self._diagnostics = {
-            "kinetic_energy": float(0.5 * (self._masses * speed2).sum()),
-            "potential_energy": float(-(self._masses[:, None] * position * np.asarray(self._scene.gravity)).sum()),
-            "elastic_energy": float(self._volume * out[:, 2 * dim].sum()),
-            "max_speed": float(np.sqrt(speed2.max(initial=0.0))),
-            "wave_speed": float(out[:, 2 * dim + 1].max(initial=0.0)),
-            "substeps": float(substeps),
-            "dt": float(dt) if np.isfinite(dt) else 0.0,
+    def _cells(self, scene: Scene) -> np.ndarray:
+        """[dim] grid cells along the box. A coarser grid whose cells would not be square is refused rather than stretched."""
+        cells = np.maximum(np.rint(np.array(scene.cells) * self._refine(scene) / self.settings["coarsen"]).astype(int), 4)
+        lower, upper = np.array(scene.bounds).T
+        edges = (upper - lower) / cells
+        if np.ptp(edges) > 1e-6 * edges[0]:
+            raise InputError(scene.name, "coarsen", self.settings["coarsen"], f"does not divide the box's cells {scene.cells} alike")
+        return cells
+
+    def _structure(self, scene: Scene) -> tuple[int, tuple, str]:
+        """What is compiled in: dimension, materials with their options, wall kind."""
+        models = tuple((material.model, *MODELS[material.model].options(material)) for material in scene.materials.values())
+        friction = scene.walls.friction
+        return scene.dim, models, "sticky" if friction == "sticky" else "coulomb" if friction > 0 else "slip"
+
+    def plan(self, scene: Scene) -> dict:
+        """What ``load`` would build for a scene, without building it.
+
+        kernels: names; fields: name -> [bytes an entry, entries]; left_out: name -> reason; bytes; particles; recorded; cells;
+        substeps_per_frame: (at rest, at the speed of a fall through the whole box).
+        """
+        dim, models, friction = self._structure(scene)
+        particles, cells = scene.particles(self._refine(scene)), self._cells(scene)
+        lower, upper = np.array(scene.bounds).T
+        dx = float((upper[0] - lower[0]) / cells[0])
+        n, nodes = _power_of_two(len(particles.position)), int(np.prod(cells + 2 * WALL + 1))
+        particle_fields = {"x": dim, "v": 4, **{f"C{axis}": 4 for axis in range(dim)}}
+        left_out = {"third dimension": "a 2D scene"} if dim == 2 else {}
+        for name, *_ in models:
+            particle_fields |= {f"{name}.{field}": width for field, width in MODELS[name].state(dim).items()}
+            left_out |= MODELS[name].left_out
+        if len(models) == 1:
+            left_out["material of a particle"] = "one material"
+        left_out["signed distance"] = "no obstacles"
+        left_out["context"] = "no moving container, no varying parameter"
+        if friction == "slip":
+            left_out["wall friction"] = "slip walls"
+        fields = {name: (4 * width, n) for name, width in particle_fields.items()}
+        fields |= {f"saved {name}": entry for name, entry in fields.items()}
+        fields["grid"] = (16, nodes)
+        speeds = [MODELS[material.model].rest_wave_speed(material, self.settings["stiffness"]) for material in scene.materials.values()]
+        gravity = float(np.linalg.norm(scene.gravity))
+        start = float(np.sqrt((particles.velocity**2).sum(1).max()))
+        fall = float(np.sqrt(start**2 + 2 * gravity * np.linalg.norm(upper - lower)))
+        limit = (self.settings["cfl"] or scene.cfl) * dx
+        substeps = [max(1, int(np.ceil(scene.frame_step * (max(speeds) + v + gravity * scene.frame_step) / limit))) for v in (0.0, fall)]
+        return {
+            "dim": dim, "materials": [name for name, *_ in models], "walls": friction, "kernels": ["load", "restore", "frame_serial"],
+            "fields": fields, "left_out": left_out, "bytes": sum(size * count for size, count in fields.values()),
+            "particles": len(particles.position), "recorded": len(particles.tracked), "cells": cells.tolist(), "grid_spacing": dx,
+            "wave_speed": max(speeds), "substeps_per_frame": substeps,
         }
+
+    def _run(self, substeps: int, dt: float, keep: bool) -> np.ndarray:
+        sums = np.zeros(SUMS)
+        self._kernels.frame(substeps, dt, int(keep), self._position, sums)
+        self._diagnostics = {
+            "kinetic_energy": sums[0], "potential_energy": sums[1], "elastic_energy": sums[2], "max_speed": float(np.sqrt(sums[3])),
+            "wave_speed": sums[4], "substeps": float(substeps), "dt": dt,
+        }
+        return sums
 
     def frame(self) -> np.ndarray:
         """Advance one frame; positions of the recorded particles, [n, dim] float32. Raises ``SimulationError``.
@@ -383,20 +462,14 @@ class MPMSimulator:
         kernels, scene, known = self._kernels, self._scene, self._diagnostics
         reach = float(np.linalg.norm(scene.gravity)) * scene.frame_step
         substeps = max(1, int(np.ceil(scene.frame_step * (known["wave_speed"] + known["max_speed"] + reach) / (self._cfl * self.dx))))
-        kernels.save()
         for attempt in range(MAX_HALVINGS + 1):
             dt = scene.frame_step / substeps
-            kernels.fastest[None] = 0.0
-            self._run(substeps, dt)
-            # Sums carry a NaN to the host, where fast-math cannot optimise the test away.
-            if np.isfinite(self._out.sum(dtype=np.float64)):
-                fastest = float(np.sqrt(kernels.fastest[None]))
-                self._diagnose(substeps, dt)
-                speed = max(fastest, self._diagnostics["max_speed"])
-                courant = dt * (speed + self._diagnostics["wave_speed"]) / self.dx
-                if courant <= COURANT_GROWTH * self._cfl and dt * speed <= self.dx:
-                    self._diagnostics["max_speed"] = self._diagnostics["max_speed"]
-                    return self._position[self._tracked].astype(np.float32)
+            sums = self._run(substeps, dt, keep=attempt == 0)
+            # NaN reaches the host in the sums, where fast-math cannot optimise the test away.
+            if np.isfinite(sums).all():
+                speed = float(np.sqrt(max(sums[3], sums[5])))
+                if dt * (speed + sums[4]) <= COURANT_GROWTH * self._cfl * self.dx and dt * speed <= self.dx:
+                    return self._position[self._tracked]
             if attempt < MAX_HALVINGS:
                 kernels.restore()
                 substeps *= 2

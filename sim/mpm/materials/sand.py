@@ -26,7 +26,6 @@ class SandModel:
     decomposition without angles in which no reflection can hide, and b - I keeps the digits of small strains in float32.
     """
 
-    state = ("b_minus_identity", "volume_gain")
     left_out = {"F": "the response is isotropic: the symmetric b = F F^T is enough", "SVD": "replaced by a symmetric decomposition of b"}
 
     def __init__(self, dim: int, capacity: int):
@@ -34,6 +33,21 @@ class SandModel:
         self.b = ti.Vector.field(dim * (dim + 1) // 2, ti.f32, capacity)
         self.v = ti.field(ti.f32, capacity)
         self.parameters = ti.field(ti.f32, 4)  # lambda, mu, k, density
+
+    @staticmethod
+    def state(dim: int) -> dict[str, int]:
+        """Per-particle state: name -> floats."""
+        return {"b - I": dim * (dim + 1) // 2, "volume gain": 1}
+
+    @staticmethod
+    def options(material) -> tuple:
+        """What is compiled in: nothing but the model."""
+        return ()
+
+    @staticmethod
+    def rest_wave_speed(material, stiffness: float) -> float:
+        E, nu = material.young_modulus * stiffness, material.poisson_ratio
+        return float(np.sqrt(E * (1 - nu) / ((1 + nu) * (1 - 2 * nu)) / material.density))
 
     def fields(self) -> list:
         """Per-particle state fields."""

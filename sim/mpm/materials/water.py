@@ -13,13 +13,26 @@ class WaterModel:
     parted; a settled drop ended a third too high.
     """
 
-    state = ("J",)
     left_out = {"F": "water needs only the volume ratio J", "decomposition": "no shear, so no principal directions"}
 
-    def __init__(self, dim: int, capacity: int):
-        self.dim = dim
+    def __init__(self, dim: int, capacity: int, seven: bool):
+        self.dim, self.seven = dim, seven
         self.J = ti.field(ti.f32, capacity)
         self.parameters = ti.field(ti.f32, 3)  # B, gamma, c
+
+    @staticmethod
+    def state(dim: int) -> dict[str, int]:
+        """Per-particle state: name -> floats."""
+        return {"J": 1}
+
+    @staticmethod
+    def options(material) -> tuple:
+        """What is compiled in: gamma = 7 needs three products where any other exponent needs a power function."""
+        return (material.gamma == 7.0,)
+
+    @staticmethod
+    def rest_wave_speed(material, stiffness: float) -> float:
+        return material.sound_speed * float(np.sqrt(stiffness))
 
     def fields(self) -> list:
         """Per-particle state fields."""
@@ -27,7 +40,7 @@ class WaterModel:
 
     def configure(self, material, stiffness: float) -> None:
         """Load the material's numbers; ``stiffness`` multiplies the bulk modulus (a softened rung of a ladder)."""
-        c = material.sound_speed * np.sqrt(stiffness)
+        c = self.rest_wave_speed(material, stiffness)
         self.parameters.from_numpy(np.array([material.density * c * c / material.gamma, material.gamma, c], np.float32))
 
     @ti.func
@@ -36,26 +49,33 @@ class WaterModel:
         self.J[p] = 1.0
 
     @ti.func
+    def power(self, J):
+        """J^(1 - gamma)."""
+        result = 1.0
+        if ti.static(self.seven):
+            i2 = 1.0 / (J * J)
+            result = i2 * i2 * i2
+        else:
+            result = J ** (1.0 - self.parameters[1])
+        return result
+
+    @ti.func
     def kirchhoff(self, p, gradient_dt):
         J = self.J[p] * (1.0 + gradient_dt.trace())
         self.J[p] = J
-        pressure = self.parameters[0] * (J ** (-self.parameters[1]) - 1.0)
-        return ti.Matrix.identity(ti.f32, self.dim) * (-J * pressure)
+        return ti.Matrix.identity(ti.f32, self.dim) * (-self.parameters[0] * (self.power(J) - J))
 
     @ti.func
     def energy_density(self, p):
-        """psi = B [(J^(1-gamma) - 1) / (gamma - 1) + J - 1], whose derivative is -p; expanded about J = 1 where f32 cancels."""
-        J, B, gamma = self.J[p], self.parameters[0], self.parameters[1]
+        """psi = B [(J^(1-gamma) - 1) / (gamma - 1) + J - 1], whose derivative is -p; expanded about J = 1, where float32 cancels."""
+        J, gamma = self.J[p], self.parameters[1]
         e = 1.0 - J
-        near = 0.5 * gamma * e * e
-        full = B * 0.0
-        if e > 1e-2 and gamma > 1.0 + 1e-6:
-            full = (J ** (1.0 - gamma) - 1.0) / (gamma - 1.0) + J - 1.0
-        else:
-            full = near * (1.0 + (gamma + 1.0) / 3.0 * e)
-        return B * full
+        psi = 0.5 * gamma * e * e * (1.0 + (gamma + 1.0) / 3.0 * e)
+        if ti.abs(e) > 1e-2 and gamma > 1.0 + 1e-6:
+            psi = (self.power(J) - 1.0) / (gamma - 1.0) - e
+        return self.parameters[0] * psi
 
     @ti.func
     def wave_speed(self, p):
         """c = c0 J^(-(gamma - 1) / 2), from c^2 = dp/drho."""
-        return self.parameters[2] * self.J[p] ** (-0.5 * (self.parameters[1] - 1.0))
+        return self.parameters[2] * ti.sqrt(self.power(self.J[p]))
