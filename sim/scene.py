@@ -27,6 +27,8 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 Range = Finite | tuple[Finite, Finite]
 
 _TRIES = 2000
+#: More particles than this in one body are a slip of the keyboard, and would exhaust the memory before anything could say so.
+_MOST_PARTICLES = 100_000_000
 
 
 class _Strict(BaseModel):
@@ -111,7 +113,7 @@ class _Physics(_Strict):
     bounds: list[tuple[Finite, Finite]]
     gravity: list[Finite]
     frame_step: Positive
-    frames: Annotated[int, Field(ge=2)]
+    frames: Annotated[int, Field(ge=2, le=1_000_000)]
     radius: Positive
     cells: list[Annotated[int, Field(ge=4, le=4096)]]
     particles_per_cell: Annotated[int, Field(ge=1, le=4)] = 2
@@ -377,6 +379,10 @@ class SceneFamily:
         low, high = body.extent()
         if (low < lower - 1e-9).any() or (high > upper + 1e-9).any():
             return "outside the box"
+        particles = float(np.prod((high - low) / model.spacing + 1)) * model.refine**model.dim
+        if particles > _MOST_PARTICLES:
+            remedy = f"a body would hold {particles:.1g} particles; use fewer cells, particles_per_cell or refine"
+            raise InputError(self.where, "cells", model.cells, remedy)
         if not len(_cube_centers(body, model.spacing)):
             return "too thin to hold a particle"
         for other in others:
