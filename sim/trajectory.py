@@ -128,6 +128,10 @@ def _check(condition: bool, path: Path, key: str, value: object, remedy: str) ->
         raise InputError(path, key, value, remedy)
 
 
+#: What h5py and NumPy raise on a damaged file, by experiment with flipped bytes.
+_DAMAGE = (OSError, KeyError, RuntimeError, TypeError, ValueError, AttributeError, MemoryError, OverflowError)
+
+
 class ShardReader:
     """Lazy reader of one shard; windows are read from disk on demand. Safe on damaged files: every fault is an ``InputError``.
 
@@ -142,20 +146,32 @@ class ShardReader:
     def __getstate__(self) -> dict:
         return {"path": self.path, "_file": None, "_meta": {}}
 
+    @contextmanager
+    def _reading(self, what: str) -> Iterator[None]:
+        """Whatever goes wrong with a damaged file inside is an ``InputError``."""
+        try:
+            yield
+        except InputError:
+            raise
+        except _DAMAGE as error:
+            fault = str(error) or type(error).__name__
+            raise InputError(self.path, what, fault, "damaged or incomplete; delete the shard and generate again") from None
+
     @property
     def file(self) -> h5py.File:
         if self._file is None:
             if not self.path.is_file():
                 raise InputError(self.path, "file", str(self.path), "no such shard; generate it or correct the path")
             try:
-                self._file = h5py.File(self.path, "r")
-                version = self._file.attrs.get("format_version")
+                file = h5py.File(self.path, "r")
             except OSError as error:
-                self._file = None
                 fault = str(error).split("(")[-1].rstrip(")")
                 raise InputError(self.path, "file", fault, "not a readable HDF5 file (truncated?); delete it and generate again") from None
-            remedy = f"this version reads {FORMAT_VERSION}; generate the file again"
-            _check(version is not None and int(version) == FORMAT_VERSION, self.path, "format_version", version, remedy)
+            with self._reading("format_version"):
+                version = file.attrs.get("format_version")
+                remedy = f"this version reads {FORMAT_VERSION}; generate the file again"
+                _check(version is not None and int(version) == FORMAT_VERSION, self.path, "format_version", version, remedy)
+            self._file = file
         return self._file
 
     def close(self) -> None:
@@ -171,28 +187,30 @@ class ShardReader:
 
     def indices(self) -> list[int]:
         """Trajectory indices in the shard, ascending."""
-        names = list(self.file.keys())
-        _check(all(name.isdigit() for name in names), self.path, "groups", names, "group names must be trajectory indices")
+        with self._reading("groups"):
+            names = list(self.file.keys())
+        _check(all(name.isascii() and name.isdigit() for name in names), self.path, "groups", names, "group names must be trajectory indices")
         return sorted(int(name) for name in names)
 
     def _group(self, index: int) -> h5py.Group:
-        try:
-            return self.file[f"{index:06d}"]
-        except KeyError:
-            raise InputError(self.path, "trajectory", index, f"the shard holds {self.indices()}") from None
+        name = f"{index:06d}"
+        with self._reading(name):
+            if name in self.file:
+                group = self.file[name]
+                _check(isinstance(group, h5py.Group), self.path, name, str(group), "must be a group; generate the shard again")
+                return group
+        raise InputError(self.path, "trajectory", index, f"the shard holds {self.indices()}")
 
     def meta(self, index: int) -> dict:
         """Frame step, radius, bounds, resolved scene, seed, simulator and status of one trajectory, checked."""
         if index not in self._meta:
             group = self._group(index)
-            try:
+            with self._reading(f"{index:06d}"):
                 meta = json.loads(group.attrs["meta"])
                 position, kinds = group["position"], group["particle_type"]
                 bounds = np.asarray(meta["bounds"], float)
                 numbers = [float(meta["frame_step"]), float(meta["radius"]), int(meta["seed"])]
                 meta["scene"], meta["simulator"], str(meta["status"])
-            except (KeyError, ValueError, TypeError, OSError) as error:
-                raise InputError(self.path, f"{index:06d}", str(error), "incomplete trajectory; delete the shard and generate again") from None
             shape = getattr(position, "shape", None)
             remedy = "must be float32 [frames, particles, 2 or 3]"
             sound = isinstance(position, h5py.Dataset) and len(shape) == 3 and position.dtype == np.float32 and shape[2] in (2, 3)
@@ -213,22 +231,26 @@ class ShardReader:
     def positions(self, index: int, start: int = 0, stop: int | None = None, step: int = 1) -> np.ndarray:
         """[frames, particles, dim] float32 of frames ``start:stop:step``."""
         self.meta(index)
-        try:
+        with self._reading(f"{index:06d}/position"):
             return self._group(index)["position"][start:stop:step]
-        except OSError as error:
-            raise InputError(self.path, f"{index:06d}/position", str(error), "damaged data; delete the shard and generate again") from None
 
     def particle_type(self, index: int) -> np.ndarray:
+        """[particles] int8, ids of ``PARTICLE_TYPES``."""
         self.meta(index)
-        return self._group(index)["particle_type"][:]
+        with self._reading(f"{index:06d}/particle_type"):
+            return self._group(index)["particle_type"][:]
 
     def context(self, index: int) -> np.ndarray | None:
+        """[frames, c] float32, or None."""
         group = self._group(index)
-        return group["context"][:] if "context" in group else None
+        with self._reading(f"{index:06d}/context"):
+            return group["context"][:] if "context" in group else None
 
     def diagnostics(self, index: int) -> dict[str, np.ndarray]:
+        """Name -> [frames] float64."""
         group = self._group(index)
-        return {name: group["diagnostics"][name][:] for name in group["diagnostics"]} if "diagnostics" in group else {}
+        with self._reading(f"{index:06d}/diagnostics"):
+            return {name: group["diagnostics"][name][:] for name in group["diagnostics"]} if "diagnostics" in group else {}
 
     def read(self, index: int) -> Trajectory:
         """The whole trajectory."""
