@@ -85,9 +85,8 @@ def bf16_units() -> list[str]:
     return [name for name in ("amx_bf16", "avx512_bf16", "bf16") if name in flags]
 
 
-def errors(model: GNS, windows: Windows) -> tuple[float, float]:
+def errors(model: GNS, windows: Windows, textbook: type[torch.nn.Module]) -> tuple[float, float]:
     """Relative errors of output and gradient against the textbook form in float64, on one graph."""
-    textbook = load_textbook()
     with torch.no_grad():
         position = windows.position[:6]
         graph = radius_graph(position[-1], model.radius)
@@ -99,7 +98,8 @@ def errors(model: GNS, windows: Windows) -> tuple[float, float]:
         gradients = torch.autograd.grad(output.square().sum(), list(network.parameters()))
         return output.detach().double(), torch.cat([gradient.flatten().double() for gradient in gradients])
 
-    double = textbook(copy.deepcopy(model.network).double())
+    double = copy.deepcopy(model.network).double()
+    double = double if isinstance(double, textbook) else textbook(double)
     wanted, found = run(double, nodes.double(), edges.double()), run(model.network, nodes, edges)
     return tuple(float((a - b).norm() / b.norm()) for a, b in zip(found, wanted, strict=True))
 
@@ -112,8 +112,9 @@ def measure(size: str, particles: int, repeats: int, precisions: list[str]) -> d
     for name in ["textbook", *precisions]:
         torch.manual_seed(0)
         models[name] = build("gns", {"latent": latent, "message_passing": blocks, "precision": "f32" if name == "textbook" else name}, spec)
-    error = {name: dict(zip(("output", "gradient"), errors(models[name], windows), strict=True)) for name in precisions}
-    models["textbook"].network = load_textbook()(models["textbook"].network)
+    textbook = load_textbook()
+    models["textbook"].network = textbook(models["textbook"].network)
+    error = {name: dict(zip(("output", "gradient"), errors(model, windows, textbook), strict=True)) for name, model in models.items()}
 
     def roll(model: GNS) -> Callable[[], object]:
         def step():
@@ -142,19 +143,20 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=ROOT / "benchmarks" / "results" / "gns.json")
     parser.add_argument("--sizes", nargs="+", choices=list(SIZES), default=list(SIZES))
-    parser.add_argument("--precisions", nargs="+", choices=["f32", "bf16"], default=["f32", "bf16"])
+    parser.add_argument("--precisions", nargs="+", choices=["f32", "bf16"], help="default: f32, and bf16 where the processor has units for it")
     parser.add_argument("--particles", type=int, default=1000)
     parser.add_argument("--repeats", type=int, default=7)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     units = bf16_units()
+    precisions = arguments.precisions or (["f32", "bf16"] if units else ["f32"])
     results = {
         "machine": platform.processor() or platform.machine(), "capability": torch.backends.cpu.get_cpu_capability(), "torch": torch.__version__,
         "bf16_units": units, "sizes": {},
     }
-    print(f"capability {results['capability']}, bf16 units: {', '.join(units) or 'none, bf16 is emulated'}")
+    print(f"capability {results['capability']}, bf16 units: {', '.join(units) or 'none, so bf16 is emulated and left out unless asked for'}")
     for size in arguments.sizes:
-        found = results["sizes"][size] = measure(size, arguments.particles, arguments.repeats, arguments.precisions)
+        found = results["sizes"][size] = measure(size, arguments.particles, arguments.repeats, precisions)
         print(f"{size}: latent {found['latent']}, M {found['message_passing']}, {found['particles']} particles, {found['edges']} edges")
         for kind in ("rollout_step", "training_step"):
             for name, row in found[kind].items():

@@ -54,7 +54,9 @@ class Settings(BaseModel):
     noise_unit: Literal["velocity_std", "absolute"] = "velocity_std"  # of ``noise``: rms velocity std over the axes, or length / model frame
     ballistic: bool = False  # predictions start from gravity * dt^2 instead of the mean acceleration
     unroll: tuple[PositiveInt, ...] = Field((1,), min_length=1)  # calls the loss is unrolled over, in equal shares of the training: (1, 2, 4)
-    precision: Literal["f32", "bf16"] = "f32"  # of products and edge latents; particle latents, sums and weight gradients stay f32
+    # Of products and edge latents; particle latents, sums and weight gradients stay f32. A CPU without bf16 units (AMX, AVX-512 BF16)
+    # emulates bf16, many times slower than f32.
+    precision: Literal["f32", "bf16"] = "f32"
     edge_cap: float = Field(4.0, gt=1)  # a rollout fails when its edges exceed this multiple of their first number (it clumps)
 
 
@@ -155,14 +157,14 @@ class _EdgeUpdate(torch.autograd.Function):
         grad_biases = [torch.zeros_like(gamma) for _ in weights]
         grad_gamma, grad_beta = torch.zeros_like(gamma), torch.zeros_like(beta)
         first, weights = first.to(dtype), [w.to(dtype) for w in weights]
-        grad_edges = torch.empty_like(edges)
+        # ``Network`` hands e + m to the next block alone, so its gradient is nobody else's: it becomes e's own in place.
+        grad_edges = torch.zeros_like(edges) if grad_updated is None else grad_updated.contiguous()
         grad_input = torch.empty_like(edges)  # of the first layer's sum: what every edge sends back to its two particles
         grad_table = edges.new_empty(graph.particles, 2, len(gamma))
         for run in graph.runs:
             at = run.edges
             gradient = grad_sums.index_select(0, graph.receiver[at])
-            if grad_updated is not None:
-                gradient.add_(grad_updated[at])
+            gradient.add_(grad_edges[at])
             gradient, gamma_part, beta_part = torch.ops.aten.native_layer_norm_backward(
                 gradient, z[at].to(gamma.dtype), [len(gamma)], mean[at], rstd[at], gamma, beta, [True, True, True])
             grad_gamma += gamma_part
@@ -175,10 +177,7 @@ class _EdgeUpdate(torch.autograd.Function):
                 out = grad_input[at] if k == 0 else gradient
                 gradient = torch.ops.aten.threshold_backward.grad_input(gradient, hidden[k][at], 0, grad_input=out)
             grad_first += gradient.t() @ edges[at]
-            if grad_updated is None:
-                torch.mm(gradient, first, out=grad_edges[at])
-            else:
-                torch.addmm(grad_updated[at], gradient, first, out=grad_edges[at])
+            grad_edges[at].addmm_(gradient, first)
             grad_table[run.receivers, 0] = _bag_sum(gradient, run.order, run.offsets)
         grad_table[:, 1] = _bag_sum(grad_input, graph.reverse, graph.offsets)
         layers = [gradient for pair in zip(grad_weights, grad_biases, strict=True) for gradient in pair]
