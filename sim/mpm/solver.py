@@ -15,7 +15,7 @@ import numpy as np
 from sim.errors import InputError
 from sim.mpm.materials import MODELS
 from sim.mpm.walls import wall
-from sim.scene import Scene
+from sim.scene import Particles, Scene
 from sim.simulator import Kind, SimulationError, Start
 from sim.taichi_runtime import start_taichi, ti
 
@@ -61,7 +61,6 @@ class _Kernels:
         self.dx, self.coefficient = ti.field(ti.f32, ()), ti.field(ti.f32, ())
         self.lower, self.gravity = ti.Vector.field(dim, ti.f32, ()), ti.Vector.field(dim, ti.f32, ())
         self.E = ti.Vector.field(4, ti.f32, 3)
-        self.E.from_numpy(np.eye(3, 4, dtype=np.float32))
         self.state = [self.x, self.v, *self.C, *(field for material in self.materials for field in material.fields())]
         self.saved = [ti.field(ti.f32, capacity) if isinstance(field, ti.ScalarField) else ti.Vector.field(field.n, ti.f32, capacity) for field in self.state]
         self.frame = self.frame_serial if serial else self.frame_parallel
@@ -127,7 +126,7 @@ class _Kernels:
             self.grid[I] = cell
 
     @ti.func
-    def extrapolate(self, axis: ti.template(), side: ti.template(), I):
+    def extrapolate(self, axis: ti.template(), side, I):
         """Ghost node behind a wall: v(-1) = 2 v(0) - v(1). ``I`` names the line; its entry along ``axis`` is not used.
 
         Any linear velocity field is then interpolated exactly up to the wall: nothing creeps into it, and tr C is the true
@@ -135,7 +134,7 @@ class _Kernels:
         gather on the floor at reference density.
         """
         at = self.extent[side][axis]
-        inward = ti.static(1 - 2 * side)
+        inward = 1 - 2 * side
         ghost = ti.Vector([(at - inward if d == axis else I[d]) for d in ti.static(range(self.dim))])
         held = ti.Vector([(at if d == axis else I[d]) for d in ti.static(range(self.dim))])
         inner = ti.Vector([(at + inward if d == axis else I[d]) for d in ti.static(range(self.dim))])
@@ -235,16 +234,17 @@ class _Kernels:
                     for j in range(low[1], high[1] + 3):
                         for k in range(low[2], high[2] + 3):
                             self.update_node(ti.Vector([i, j, k]), dt)
-            for axis, side in ti.static(ti.ndrange(self.dim, 2)):
-                touched = low[axis] < WALL if ti.static(side == 0) else high[axis] + 2 > self.extent[1][axis]
-                if touched:
-                    if ti.static(self.dim == 2):
-                        for i in range(low[1 - axis], high[1 - axis] + 3):
-                            self.extrapolate(axis, side, ti.Vector([i, i]))
-                    else:
-                        for i in range(low[(axis + 1) % 3], high[(axis + 1) % 3] + 3):
-                            for j in range(low[(axis + 2) % 3], high[(axis + 2) % 3] + 3):
-                                self.extrapolate(axis, side, ti.Vector([(0 if d == axis else i if d == (axis + 1) % 3 else j) for d in ti.static(range(3))]))
+            for axis in ti.static(range(self.dim)):
+                for side in range(2):
+                    if (side == 0 and low[axis] < WALL) or (side == 1 and high[axis] + 2 > self.extent[1][axis]):
+                        if ti.static(self.dim == 2):
+                            for i in range(low[1 - axis], high[1 - axis] + 3):
+                                self.extrapolate(axis, side, ti.Vector([i, i]))
+                        else:
+                            for i in range(low[(axis + 1) % 3], high[(axis + 1) % 3] + 3):
+                                for j in range(low[(axis + 2) % 3], high[(axis + 2) % 3] + 3):
+                                    line = ti.Vector([(0 if d == axis else i if d == (axis + 1) % 3 else j) for d in ti.static(range(3))])
+                                    self.extrapolate(axis, side, line)
             fastest = 0.0
             for p in range(self.range[ti.static(len(self.models))]):
                 fastest = ti.max(fastest, self.g2p(p, dt))
@@ -279,10 +279,10 @@ class _Kernels:
                 self.p2g(m, p, base, fx, dt)
         for I in ti.grouped(self.grid):
             self.update_node(I, dt)
-        for axis, side in ti.static(ti.ndrange(self.dim, 2)):
+        for axis in ti.static(range(self.dim)):
             for I in ti.grouped(self.grid):
-                if I[axis] == 0:
-                    self.extrapolate(axis, side, I)
+                if I[axis] < 2:
+                    self.extrapolate(axis, I[axis], I)
         for p in range(self.range[ti.static(len(self.models))]):
             ti.atomic_max(sums[5], ti.cast(self.g2p(p, dt), ti.f64))
         for I in ti.grouped(self.grid):
@@ -295,8 +295,24 @@ class _Kernels:
                 self.report(m, p, position, sums)
 
     @ti.kernel
-    def load(self, data: ti.types.ndarray(ti.f32, 2)):
-        """Positions and velocities from [n, 2 dim]; stress-free, no affine velocity."""
+    def load(self, data: ti.types.ndarray(ti.f32, 2), numbers: ti.types.ndarray(ti.f32, 2)):
+        """Positions and velocities from [n, 2 dim], stress-free, no affine velocity; numbers as ``MPMSimulator._table`` writes them.
+
+        One kernel for all: every transfer to a small field compiles a kernel of its own.
+        """
+        for _ in range(1):
+            self.dx[None], self.coefficient[None] = numbers[0, 0], numbers[0, 1]
+            for d in ti.static(range(self.dim)):
+                self.lower[None][d], self.gravity[None][d] = numbers[1, d], numbers[2, d]
+                for side in ti.static(range(2)):
+                    self.extent[side][d] = ti.cast(numbers[3 + side, d], ti.i32)
+            for a, lane in ti.static(ti.ndrange(3, 4)):
+                self.E[a][lane] = ti.cast(numbers[5, 0], ti.f32) * float(a == lane)
+            for m in ti.static(range(len(self.models))):
+                self.range[m + 1] = ti.cast(numbers[6 + m, 0], ti.i32)
+                self.mass_volume[m] = ti.Vector([numbers[6 + m, 1], numbers[6 + m, 2]])
+                for k in ti.static(range(self.materials[m].parameters.shape[0])):
+                    self.materials[m].parameters[k] = numbers[6 + m, 3 + k]
         for m in ti.static(range(len(self.models))):
             for p in range(self.range[m], self.range[m + 1]):
                 self.v[p] = ti.Vector.zero(ti.f32, 4)
@@ -361,32 +377,38 @@ class MPMSimulator:
         old, fresh = self._kernels, False
         if old is None or (old.dim, old.models, old.friction) != structure or old.nodes != nodes or old.capacity < capacity:
             self._kernels, fresh = _Kernels(*structure, capacity, nodes, serial), True
-        kernels, dim, n = self._kernels, scene.dim, len(particles.position)
+        kernels = self._kernels
         lower, upper = np.array(scene.bounds).T
         cells = self._cells(scene)
         self.dx = float((upper[0] - lower[0]) / cells[0])
         self._scene, self._tracked = scene, particles.tracked
-        volume = particles.spacing**dim
-        kernels.range.from_numpy(np.searchsorted(particles.material, np.arange(len(scene.materials) + 1)).astype(np.int32))
-        kernels.mass_volume.from_numpy(np.array([[material.density * volume, volume] for material in scene.materials.values()], np.float32))
-        kernels.extent.from_numpy(np.stack([np.full(dim, WALL), WALL + cells]).astype(np.int32))
-        for model, material in zip(kernels.materials, scene.materials.values(), strict=True):
-            model.configure(material, self.settings["stiffness"])
         position = particles.position
         if self.settings["perturbation"]:
             position = position + np.random.default_rng(np.random.SeedSequence([scene.seed, 2])).normal(size=position.shape) * self.settings["perturbation"]
         # Where a wall stops particles during the run, it also holds the start.
         cell = np.clip((position - lower) / self.dx + WALL, WALL + HAIR, WALL + cells - HAIR)
-        kernels.load(np.ascontiguousarray(np.concatenate([cell, particles.velocity], 1).astype(np.float32)))
-        friction = scene.walls.friction
-        kernels.dx[None], kernels.coefficient[None] = self.dx, 0.0 if friction == "sticky" else friction
-        kernels.lower[None], kernels.gravity[None] = lower.tolist(), list(scene.gravity)
+        data = np.ascontiguousarray(np.concatenate([cell, particles.velocity], 1).astype(np.float32))
+        kernels.load(data, self._table(scene, particles, cells))
         self._cfl = self.settings["cfl"] or scene.cfl
-        self._position = np.zeros((n, dim), np.float32)
+        self._position = np.zeros((len(position), scene.dim), np.float32)
         self._run(0, 0.0, keep=True)
         if fresh:
             kernels.restore()
             self.compile_seconds += time.perf_counter() - begun
+
+    def _table(self, scene: Scene, particles: Particles, cells: np.ndarray) -> np.ndarray:
+        """All numbers of a scene that kernels need, [6 + materials, 8] float32, a row a thing."""
+        table = np.zeros((6 + len(scene.materials), 8))
+        dim, friction, volume = scene.dim, scene.walls.friction, particles.spacing**scene.dim
+        table[0, :2] = self.dx, 0.0 if friction == "sticky" else friction
+        table[1, :dim], table[2, :dim] = np.array(scene.bounds)[:, 0], scene.gravity
+        table[3, :dim], table[4, :dim] = WALL, WALL + cells
+        table[5, 0] = 1.0
+        ends = np.searchsorted(particles.material, np.arange(1, len(scene.materials) + 1))
+        for row, (end, material) in enumerate(zip(ends, scene.materials.values(), strict=True), start=6):
+            numbers = MODELS[material.model].numbers(material, dim, self.settings["stiffness"])
+            table[row, : 3 + len(numbers)] = end, material.density * volume, volume, *numbers
+        return table.astype(np.float32)
 
     def _refine(self, scene: Scene) -> int:
         return scene.refine if self.settings["particles"] == "teacher" else 1
@@ -448,8 +470,8 @@ class MPMSimulator:
         sums = np.zeros(SUMS)
         self._kernels.frame(substeps, dt, int(keep), self._position, sums)
         self._diagnostics = {
-            "kinetic_energy": sums[0], "potential_energy": sums[1], "elastic_energy": sums[2], "max_speed": float(np.sqrt(sums[3])),
-            "wave_speed": sums[4], "substeps": float(substeps), "dt": dt,
+            **dict(zip(("kinetic_energy", "potential_energy", "elastic_energy"), sums[:3].tolist(), strict=True)), "max_speed": float(np.sqrt(sums[3])),
+            "wave_speed": float(sums[4]), "substeps": float(substeps), "dt": dt,
         }
         return sums
 

@@ -53,13 +53,14 @@ class SandModel:
         """Per-particle state fields."""
         return [self.b, self.v]
 
-    def configure(self, material, stiffness: float) -> None:
-        """Load the material's numbers; ``stiffness`` multiplies Young's modulus (a softened rung of a ladder)."""
-        E, nu, d = material.young_modulus * stiffness, material.poisson_ratio, self.dim
+    @staticmethod
+    def numbers(material, dim: int, stiffness: float) -> tuple[float, ...]:
+        """What ``parameters`` holds; ``stiffness`` multiplies Young's modulus (a softened rung of a ladder)."""
+        E, nu = material.young_modulus * stiffness, material.poisson_ratio
         lam, mu = E * nu / ((1 + nu) * (1 - 2 * nu)), E / (2 * (1 + nu))
         sin_phi = np.sin(np.radians(material.friction_angle))
-        alpha = sin_phi / np.sqrt(2) if d == 2 else np.sqrt(2 / 3) * 2 * sin_phi / (3 - sin_phi)
-        self.parameters.from_numpy(np.array([lam, mu, alpha * (d * lam + 2 * mu) / (2 * mu), material.density], np.float32))
+        alpha = sin_phi / np.sqrt(2) if dim == 2 else np.sqrt(2 / 3) * 2 * sin_phi / (3 - sin_phi)
+        return lam, mu, alpha * (dim * lam + 2 * mu) / (2 * mu), material.density
 
     @ti.func
     def reset(self, p):

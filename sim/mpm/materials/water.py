@@ -38,10 +38,11 @@ class WaterModel:
         """Per-particle state fields."""
         return [self.J]
 
-    def configure(self, material, stiffness: float) -> None:
-        """Load the material's numbers; ``stiffness`` multiplies the bulk modulus (a softened rung of a ladder)."""
-        c = self.rest_wave_speed(material, stiffness)
-        self.parameters.from_numpy(np.array([material.density * c * c / material.gamma, material.gamma, c], np.float32))
+    @classmethod
+    def numbers(cls, material, dim: int, stiffness: float) -> tuple[float, ...]:
+        """What ``parameters`` holds; ``stiffness`` multiplies the bulk modulus (a softened rung of a ladder)."""
+        c = cls.rest_wave_speed(material, stiffness)
+        return material.density * c * c / material.gamma, material.gamma, c
 
     @ti.func
     def reset(self, p):
