@@ -352,3 +352,17 @@ def test_two_runs_on_one_folder(tmp_path, here):
         assert process.wait(timeout=60) == 0
         process.stderr.close()
     assert set(json.loads((folder / "dataset.json").read_text())["splits"]) == {"train", "valid"}
+
+
+def test_the_solver_gives_a_trajectory_the_same_bits_alone_and_in_company():
+    """Fields made for a larger scene, or left over from another, must not show."""
+    from sim.mpm.solver import MPMSimulator
+
+    scenes = [family(frames=30).sample(seed) for seed in (1, 2, 3)]
+    scenes.sort(key=lambda scene: len(scene.particle_type()))
+    company = MPMSimulator()
+    company.load(family(frames=30, bodies=[{"material": "water", "shape": {"kind": "box", "size": [0.8, 0.8]}}]).sample(0))
+    together = [simulate(company, scene) for scene in reversed(scenes)][::-1]
+    alone = simulate(MPMSimulator(), scenes[0])
+    np.testing.assert_array_equal(together[0].position, alone.position)
+    assert all(np.array_equal(together[0].diagnostics[name], alone.diagnostics[name]) for name in alone.diagnostics)

@@ -203,7 +203,8 @@ def test_variants():
 @pytest.mark.parametrize(
     ("text", "message"),
     [("a: [1", "not valid YAML"), ("a: 1\na: 2", "line 2 = \"duplicate key 'a'\""), ("- 1", "must be a mapping"), ("", "must be a mapping"),
-     ("1: 2", "not text"), ("a: !!python/object/apply:os.system [id]", "not valid YAML"), ("a: &x [*x, *x]", "scene.yaml"), ("? [1, 2]\n: 3", "not text")],
+     ("1: 2", "not text"), ("a: !!python/object/apply:os.system [id]", "not valid YAML"), ("a: &x [*x, *x]", "scene.yaml"),
+     ("? [1, 2]\n: 3", "not text")],
 )
 def test_files_that_are_not_scenes(tmp_path, text, message):
     path = tmp_path / "scene.yaml"
