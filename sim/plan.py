@@ -76,8 +76,8 @@ def plan_text(family: SceneFamily, jobs: int = 1) -> str:
         *(f"    {name}: {entries} x {size} bytes" for name, (size, entries) in solver["fields"].items()),
         "  left out:",
         *(f"    {name}: {reason}" for name, reason in solver["left_out"].items()),
-        f"  substeps a frame: {found.substeps[0]} at rest, {found.substeps[1]} at the speed of a fall through the box "
-        f"(wave speed {solver['wave_speed']:.3g} m/s)",
+        f"  substeps a frame: {found.substeps[0]} at rest, {found.substeps[1]} at the speed of a fall through the box, "
+        f"more in an impact that squeezes (wave speed {solver['wave_speed']:.3g} m/s)",
         f"  cost of a trajectory: {found.particle_substeps / 1e6:.1f} million particle-substeps, about {_duration(found.seconds)} "
         f"on one core at {found.rate / 1e6:g} million a second; {_size(found.disk)} on disk",
     ]
