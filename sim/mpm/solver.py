@@ -370,7 +370,8 @@ class MPMSimulator:
     def load(self, scene: Scene) -> None:
         """Set the state of frame 0; allocates and compiles on first use of a structure (``compile_seconds``)."""
         begun = time.perf_counter()
-        serial = (start_taichi() == "cpu") if self.serial is None else self.serial
+        arch = start_taichi()
+        serial = arch == "cpu" if self.serial is None else self.serial
         particles = scene.particles(self._refine(scene))
         structure, nodes = self._structure(scene), tuple(int(c) + 2 * WALL + 1 for c in self._cells(scene))
         capacity = _power_of_two(len(particles.position))
