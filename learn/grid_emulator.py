@@ -2,16 +2,18 @@
 
 After NeuralMPM (Rochman-Sharabi, Lewin, Louppe 2024, arXiv 2408.15753), with four changes: the network runs on *occupied* nodes
 only (a dense 40 x 40 U-Net spends nine tenths of its work on empty air, and a batch of scenes needs no padding), it answers for the
-*deviation from ballistic flight* (free flight is exact and need not be learnt), it is read once, at the particles' starting places
+*deviation from flight* (free flight and its end at a wall need not be learnt), it is read once, at the particles' starting places
 (the flow map over m frames, so no second transfer per frame), and it may blend a particle's velocity towards the grid's (PIC/FLIP).
 
 One call, all lengths in box units and times in model frames (dt = 1):
 
     w_ip   = prod_a (1 - |x_p - x_i|_a / H_a)_+                              bilinear weights, node i, particle p
     vbar_i = sum_p w_ip v_p / (sum_p w_ip + eps)                             particles to grid
-    (u_i1 .. u_im, b_i) = U-Net(density_i, vbar_i, accelerations_i, walls_i)
-    v_pj   = v_p + j g + sum_i w_ip (s_j u_ij) + b_p (sum_i w_ip vbar_i - v_p),   b_p = sum_i w_ip b_i,  j = 1 .. m
-    x_pj   = x_p + v_p1 + ... + v_pj
+    f_pj   = clip(x_p + j v_p + g j (j + 1) / 2, box)                        flight, j = 1 .. m; inelastic slip walls
+    (u_i1 .. u_im, b_i) = U-Net(density_i, vbar_i, accelerations_i, walls_i, density in flight_i)
+    x_pj   = f_pj + sum_(k <= j) [ sum_i w_ip s_k u_ik + b_p (sum_i w_ip vbar_i - v_p) ],    b_p = sum_i w_ip b_i
+
+The clip acts on the flight alone: nothing stops a wrong deviation from leaving the box, so escapes stay visible.
 """
 
 from __future__ import annotations
@@ -21,7 +23,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -36,15 +38,26 @@ class GridEmulatorSettings(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     frames_per_call: int = Field(8, ge=1)  # m: model frames that one network call predicts
-    history: int = Field(3, ge=2)  # model frames of input: history - 1 velocities, the last one and their differences
+    history: int = Field(2, ge=2)  # model frames of input: history - 1 velocities, the last one and their differences
     cell: float = Field(2.0, gt=0)  # H in particle spacings (rounded so that whole cells fill the box)
     margin: int = Field(2, ge=1)  # cells kept outside each wall; a particle beyond them flies ballistically, unseen
     channels: list[int] = Field([32, 48, 64], min_length=1)  # width of each level of the U-Net, finest first; each halves the resolution
-    blocks: int = Field(1, ge=1)  # residual blocks of two convolutions at each level, on the way down and again on the way up
+    blocks: int = Field(1, ge=1)  # residual convolutions at each level, on the way down and again on the way up
     wall_reach: float = Field(4.0, gt=0)  # distance in cells at which the wall features saturate
     noise: float = Field(0.02, ge=0)  # std of the last input velocity's noise in velocity stds (random walk over the history)
     unroll: list[int] = Field([1, 2, 4], min_length=1)  # calls a training window spans; equal shares of the training
+    walls: bool = True  # the flight that the network corrects stops at the walls; off: it goes through them
+    preview: list[int] = Field([4, 8], max_length=8)  # frames of the flight at which the network is shown the density it would lead to
+    select: int = Field(0, ge=0)  # windows of a batch that are trained on, half of them drawn by how far they are from flight; 0: all
     floor: float = Field(0.03, gt=0)  # least scale of a frame's loss, in particle spacings: below it the loss would be all noise
+
+    @model_validator(mode="after")
+    def _consistent(self) -> GridEmulatorSettings:
+        if any(not 1 <= frame <= self.frames_per_call for frame in self.preview):
+            raise ValueError(f"preview must be frames from 1 to frames_per_call = {self.frames_per_call}")
+        if self.unroll != sorted(self.unroll) or self.unroll[0] < 1:
+            raise ValueError("unroll must be ascending numbers of calls")
+        return self
 
 
 def random_walk_noise(position: Tensor, std: Tensor, moving: Tensor, generator: torch.Generator) -> Tensor:
@@ -67,18 +80,18 @@ class _StencilConv(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, x: Tensor, weight: Tensor, bias: Tensor, neighbours: Tensor) -> Tensor:
-        stencil = neighbours.shape[1]
         columns = _gather(x, neighbours)
         ctx.save_for_backward(columns, weight, neighbours)
-        ctx.stencil = stencil
         return torch.addmm(bias, columns, weight.reshape(-1, weight.shape[2]))
 
     @staticmethod
     def backward(ctx, grad: Tensor) -> tuple[Tensor, Tensor, Tensor, None]:
         columns, weight, neighbours = ctx.saved_tensors
         grad = grad.contiguous()
-        back = weight.flip(0).transpose(1, 2).reshape(-1, weight.shape[1])
-        return _gather(grad, neighbours) @ back, (columns.t() @ grad).view_as(weight), grad.sum(0), None
+        back = None
+        if ctx.needs_input_grad[0]:
+            back = _gather(grad, neighbours) @ weight.flip(0).transpose(1, 2).reshape(-1, weight.shape[1])
+        return back, (columns.t() @ grad).view_as(weight), grad.sum(0), None
 
 
 def _gather(x: Tensor, neighbours: Tensor) -> Tensor:
@@ -101,16 +114,16 @@ class StencilConv(nn.Module):
 
 
 class Residual(nn.Module):
-    """x + conv(relu(conv(relu(x))))."""
+    """x + conv(relu(x))."""
 
     def __init__(self, dim: int, channels: int):
         super().__init__()
-        self.first, self.second = StencilConv(dim, channels, channels), StencilConv(dim, channels, channels)
+        self.convolution = StencilConv(dim, channels, channels)
         with torch.no_grad():
-            self.second.weight.mul_(0.5)
+            self.convolution.weight.mul_(0.7)
 
     def forward(self, x: Tensor, neighbours: Tensor) -> Tensor:
-        return x + self.second(functional.relu(self.first(functional.relu(x), neighbours)), neighbours)
+        return x + self.convolution(functional.relu(x), neighbours)
 
 
 @dataclass(frozen=True)
@@ -245,13 +258,15 @@ class GridEmulator(nn.Module):
         # One particle per cell of its own: density 1 in the bulk.
         constant("particle_mass", float(spec.spacing**dim / (extent / cells).prod()))
         self.register_buffer("corners", torch.tensor(list(itertools.product((0, 1), repeat=dim))), persistent=False)
-        self.register_buffer("axis", (torch.arange(m)[:, None] + 1).float(), persistent=False)
+        self.register_buffer("nodes", torch.tensor(nodes), persistent=False)
+        self.register_buffer("types", torch.tensor(spec.particle_types), persistent=False)
+        self.register_buffer("frame", torch.arange(1, m + 1)[:, None].float(), persistent=False)
         self.fixed = KINEMATIC_TYPE in spec.particle_types
         self.context = 0 if spec.context_mean is None else len(spec.context_mean)
         if self.context:
             constant("context_mean", spec.context_mean)
             constant("context_std", np.maximum(spec.context_std, 1e-8))
-        inputs = len(spec.particle_types) + dim * (settings.history - 1) + 2 * dim + self.context
+        inputs = len(spec.particle_types) + dim * (settings.history - 1) + 2 * dim + len(settings.preview) + self.context
         self.network = SparseUNet(dim, inputs, settings.channels, m * dim + 1, settings.blocks)
 
     # ---- one call -------------------------------------------------------------------------------------------------------------------
@@ -259,8 +274,7 @@ class GridEmulator(nn.Module):
     def weights(self, position: Tensor, example: Tensor) -> tuple[Tensor, Tensor]:
         """Flat node ids [N, 2^d] (offset by the example) and bilinear weights [N, 2^d] of positions [N, d]; zero weight off the grid."""
         place = (position - self.origin) / self.cell
-        last = torch.tensor(self.grid.shape, device=place.device) - 2
-        base = torch.minimum(place.detach().floor().long().clamp(min=0), last)
+        base = torch.minimum(place.detach().floor().long().clamp(min=0), self.nodes - 2)
         fraction = place - base
         inside = ((fraction >= 0) & (fraction <= 1)).all(1)
         node = (base[:, None] + self.corners + 1) @ self.grid.stride0 + (example * self.grid.sizes[0])[:, None]
@@ -276,48 +290,54 @@ class GridEmulator(nn.Module):
         """Interpolated node values [N, F] of [A, F]: sum_i w_ip f_i."""
         return (value.index_select(0, row.reshape(-1)).view(*row.shape, -1) * weight[:, :, None]).sum(1)
 
-    def node_features(self, density: Tensor, velocity: Tensor, node: Tensor, context: Tensor | None) -> Tensor:
-        """[A, inputs] of the density per type [A, types], the mean velocities [A, (history - 1) d], newest first, and the flat node ids.
+    def node_features(self, node: Tensor, density: Tensor, velocity: Tensor, ahead: Tensor, context: Tensor | None) -> Tensor:
+        """[A, inputs] of the flat node ids [A], the density per type [A, types], the mean velocities [A, history - 1, d], newest first,
+        and the mean densities in flight [A, previews].
 
         Density; newest velocity / velocity scale; its differences to the older ones / acceleration scale; signed distance to each wall
-        in cells, clipped to +-wall_reach and divided by it; the normalised context of the node's example.
+        in cells, clipped to +-wall_reach and divided by it; density in flight - 1; the normalised context of the node's example.
         """
-        size, dim = self.grid.sizes[0], self.spec.dim
-        newest = velocity[:, :dim]
-        past = (velocity.view(-1, self.options.history - 1, dim)[:, :-1] - velocity.view(-1, self.options.history - 1, dim)[:, 1:]).flatten(1)
-        example, local = node // size, node % size
-        padded = torch.tensor(self.grid.shape, device=node.device) + 2
-        coordinate = (torch.div(local[:, None], self.grid.stride0, rounding_mode="floor") % padded - 1).float()
-        lower = coordinate - self.options.margin
-        upper = padded - 3 - self.options.margin - coordinate
-        walls = torch.cat([lower, upper], 1).clamp(-self.options.wall_reach, self.options.wall_reach) / self.options.wall_reach
-        parts = [density, newest / self.velocity_scale, past / self.acceleration_scale, walls]
+        size, reach = self.grid.sizes[0], self.options.wall_reach
+        padded = self.nodes + 2
+        coordinate = (torch.div((node % size)[:, None], self.grid.stride0, rounding_mode="floor") % padded - 1).float()
+        walls = torch.cat([coordinate - self.options.margin, self.nodes - 1 - self.options.margin - coordinate], 1)
+        parts = [
+            density, velocity[:, 0] / self.velocity_scale, ((velocity[:, :-1] - velocity[:, 1:]) / self.acceleration_scale).flatten(1),
+            walls.clamp(-reach, reach) / reach, (ahead - 1).clamp(-1, 3),
+        ]
         if self.context:
-            parts.append(((context - self.context_mean) / self.context_std)[example])
+            parts.append(((context - self.context_mean) / self.context_std)[node // size])
         return torch.cat(parts, 1)
+
+    def density(self, position: Tensor, example: Tensor, examples: int) -> Tensor:
+        """[N, 1]: density, 1 in the bulk, that the particles at ``position`` [N, d] see at their places: sum_i w_ip m sum_q w_iq."""
+        node, weight = self.weights(position, example)
+        grid = weight.new_zeros(examples * self.grid.sizes[0]).index_add(0, node.reshape(-1), weight.reshape(-1))
+        return (grid[node] * weight).sum(1, keepdim=True) * self.particle_mass
 
     def call(self, history: Tensor, kind: Tensor, example: Tensor, examples: int, context: Tensor | None = None) -> Tensor:
         """The next m positions [m, N, d] of a history [history, N, d]; context [examples, c]. Kinematic particles come out unprescribed."""
         dim, m = self.spec.dim, self.options.frames_per_call
         position = history[-1]
-        velocity = (history[1:] - history[:-1]).flip(0).transpose(0, 1).flatten(1)
-        newest = velocity[:, :dim]
+        velocity = (history[1:] - history[:-1]).flip(0).transpose(0, 1)
+        flight = position[:, None] + velocity[:, :1] * self.frame + self.gravity * (self.frame * (self.frame + 1) / 2)
+        if self.options.walls:
+            flight = torch.minimum(torch.maximum(flight, self.bounds[:, 0]), self.bounds[:, 1])
         node, weight = self.weights(position, example)
         occupied, rows, levels = self.grid.occupy(node, examples)
         row = rows[node]
-        types = torch.tensor(self.spec.particle_types, device=kind.device)
-        one_hot = (kind[:, None] == types).to(position.dtype)
-        sums = self.to_grid(torch.cat([one_hot, velocity], 1), row, weight, len(occupied))
-        mass, momentum = sums[:, : len(types)], sums[:, len(types) :]
-        mean = momentum / (mass.sum(1, keepdim=True) + 1e-3)
-        features = self.node_features(mass * self.particle_mass, mean, occupied, context)
-        output = self.network(features, levels)
-        output = torch.cat([output[:, : m * dim], output[:, m * dim :], mean[:, :dim]], 1)
-        read = self.to_particles(output, row, weight)
-        deviation = read[:, : m * dim].view(-1, m, dim) * self.frame_scale[:, None]
-        blend = read[:, m * dim : m * dim + 1] * (read[:, m * dim + 1 :] - newest)
-        velocities = (newest + blend)[:, None] + self.gravity * self.axis + deviation
-        return position + velocities.cumsum(1).transpose(0, 1)
+        one_hot = (kind[:, None] == self.types).to(position.dtype)
+        ahead = [self.density(flight[:, frame - 1], example, examples) for frame in self.options.preview]
+        sums = self.to_grid(torch.cat([one_hot, velocity.flatten(1), *ahead], 1), row, weight, len(occupied))
+        mass, sums = sums.split((one_hot.shape[1], sums.shape[1] - one_hot.shape[1]), 1)
+        # Isolated particles leave nodes almost without mass: the constant keeps their gradients bounded.
+        mean, ahead = (sums / (mass.sum(1, keepdim=True) + 1e-3)).split((velocity.shape[1] * dim, len(ahead)), 1)
+        mean = mean.view(-1, *velocity.shape[1:])
+        output = self.network(self.node_features(occupied, mass * self.particle_mass, mean, ahead, context), levels)
+        read = self.to_particles(torch.cat([output, mean[:, 0]], 1), row, weight)
+        deviation, blend, grid_velocity = read.split((m * dim, 1, dim), 1)
+        deviation = deviation.view(-1, m, dim) * self.frame_scale[:, None] + (blend * (grid_velocity - velocity[:, 0]))[:, None]
+        return (flight + deviation.cumsum(1)).transpose(0, 1)
 
     # ---- training -------------------------------------------------------------------------------------------------------------------
 
@@ -337,6 +357,8 @@ class GridEmulator(nn.Module):
         window's frame j of a call from ballistic flight, at least ``floor`` spacings (otherwise free flight would be all noise).
         """
         history, m = self.options.history, self.options.frames_per_call
+        if 0 < self.options.select < windows.examples:
+            windows = self._select(windows, generator)
         moving = windows.particle_type != KINEMATIC_TYPE
         noise = random_walk_noise(windows.position[:history], self.options.noise * self.velocity_std, moving, generator)
         state = windows.position[:history] + noise
@@ -360,6 +382,24 @@ class GridEmulator(nn.Module):
         flight = position[now] + (position[now] - position[now - 1]) * frame + self.gravity * frame * (frame + 1) / 2
         deviation = (position[now + 1 :] - flight)[:, moving].square().mean((1, 2)).sqrt()
         return deviation.clamp(min=self.options.floor * self.spec.spacing)
+
+    def _select(self, windows: Windows, generator: torch.Generator) -> Windows:
+        """``select`` of the windows, without replacement, with p = 1/2 uniform + 1/2 proportional to the rms deviation from flight.
+
+        A window in thirty holds the first touch of a wall, and nine tenths of the error of a batch: uniform sampling starves on it.
+        """
+        position = windows.position
+        change = position[2:] - 2 * position[1:-1] + position[:-2] - self.gravity
+        energy = position.new_zeros(windows.examples).index_add(0, windows.example, change.square().sum((0, 2)))
+        rms = (energy / torch.bincount(windows.example)).sqrt().cpu()
+        chance = 0.5 / windows.examples + 0.5 * rms / rms.sum().clamp(min=1e-30)
+        chosen = torch.multinomial(chance, self.options.select, generator=generator).sort().values.to(position.device)
+        rank = torch.full((windows.examples,), -1, device=position.device)
+        rank[chosen] = torch.arange(len(chosen), device=position.device)
+        example = rank[windows.example]
+        keep = example >= 0
+        context = None if windows.context is None else windows.context[:, chosen]
+        return Windows(position[:, keep], windows.particle_type[keep], example[keep], context)
 
     # ---- simulation -----------------------------------------------------------------------------------------------------------------
 

@@ -27,7 +27,7 @@ def spec(**changes: object) -> DataSpec:
 
 def emulator(settings: dict | None = None, **changes: object) -> GridEmulator:
     torch.manual_seed(0)
-    return GridEmulator(GridEmulatorSettings(channels=[8, 8], frames_per_call=4, **(settings or {})), spec(**changes))
+    return GridEmulator(GridEmulatorSettings(**{"channels": [8, 8], "frames_per_call": 4, "preview": [2, 4], **(settings or {})}), spec(**changes))
 
 
 def awaken(model: GridEmulator, size: float = 0.1) -> GridEmulator:
@@ -150,7 +150,7 @@ def test_oracle_network_reproduces_a_turning_flow() -> None:
             now = 1 + 4 * self.call
             self.call += 1
             step = torch.from_numpy(np.diff(course, axis=0)).float()
-            deviation = step[now : now + 4] - step[now - 1] - model.gravity * model.axis
+            deviation = step[now : now + 4] - step[now - 1] - model.gravity * model.frame
             output = (deviation / model.frame_scale[:, None]).flatten()
             return torch.cat([output, torch.zeros(1)]).expand(len(x), -1)
 
@@ -203,7 +203,7 @@ def test_loss_of_free_flight_without_noise_is_zero() -> None:
 
 def test_one_example_does_not_see_another() -> None:
     model = awaken(emulator({"noise": 0.0}))
-    position = torch.from_numpy(flight(40, 3))
+    position = torch.from_numpy(flight(40, 2))
     kind, example = torch.full((40,), 5), torch.arange(40) // 20
     together = model.call(position, kind, example, 2)
     apart = torch.cat([model.call(position[:, part], kind[part], torch.zeros(20, dtype=torch.long), 1) for part in (slice(20), slice(20, 40))], 1)
@@ -255,13 +255,43 @@ def test_context_reaches_the_network_only_where_there_is_one() -> None:
     assert not np.allclose(*found, atol=1e-6)
 
 
-def test_unknown_option_is_refused() -> None:
+def test_flight_stops_at_the_walls_and_need_not() -> None:
+    truth = np.array([[[0.5, 0.011]], [[0.5, 0.001]]], np.float32)
+    found = [rollout(emulator({"walls": walls}), start(truth), 4).position[:, 0, 1] for walls in (True, False)]
+    assert np.allclose(found[0], 0.0) and (found[1] < -0.008).all()
+
+
+def test_density_is_one_in_the_bulk() -> None:
+    model = emulator()
+    axis = torch.arange(20) * 0.05 + 0.025
+    position = torch.cartesian_prod(axis, axis)
+    density = model.density(position, torch.zeros(400, dtype=torch.long), 1)
+    middle = (position - 0.5).abs().max(1).values < 0.3
+    assert torch.allclose(density[middle], torch.ones(1), atol=1e-3)
+
+
+def test_selection_prefers_windows_far_from_flight() -> None:
+    model = emulator({"select": 2, "noise": 0.0})
+    position = np.concatenate([flight(10, model.window(0.0), seed=seed) for seed in range(8)], 1)
+    position[-1, 30:40] += 0.1
+    batch = windows(position, examples=8)
+    generator, seen = torch.Generator().manual_seed(0), np.zeros(8)
+    for _ in range(400):
+        chosen = model._select(batch, generator)
+        assert chosen.examples == 2 and chosen.position.shape[1] == 20
+        seen[[int(((batch.position[0] - place).abs().sum(1)).argmin()) // 10 for place in chosen.position[0, ::10]]] += 1
+    assert seen[3] > 250 and seen.min() > 30
+    assert model.loss(batch, generator, 0.0).item() >= 0
+
+
+@pytest.mark.parametrize("fault", [{"colour": "blue"}, {"preview": [9]}, {"unroll": [2, 1]}, {"frames_per_call": 0}])
+def test_faulty_options_are_refused(fault: dict) -> None:
     with pytest.raises(ValidationError):
-        GridEmulatorSettings(colour="blue")
+        GridEmulatorSettings(**fault)
 
 
 def test_parameter_count() -> None:
-    """enter 3^2 x 10 x 8 + 8 (2 densities and velocities: 1 + 2 x 2, 4 walls); per residual block 2 (9 x 64 + 8); down, up, leave."""
+    """Inputs: density, two velocities of two components, four walls, two previews; 4 frames of two components and the blend come out."""
     model = emulator({"history": 3})
-    enter, block, down, up, leave = 9 * 9 * 8 + 8, 2 * (9 * 64 + 8), 32 * 8 + 8, 8 * 32 + 32, 8 * 9 + 9
+    enter, block, down, up, leave = 9 * 11 * 8 + 8, 9 * 64 + 8, 32 * 8 + 8, 8 * 32 + 32, 8 * 9 + 9
     assert sum(parameter.numel() for parameter in model.parameters()) == enter + 3 * block + down + up + leave
