@@ -314,7 +314,11 @@ class GNS(nn.Module):
 
     @torch.inference_mode()
     def advance(self) -> np.ndarray:
-        """The next ``stride`` frames: one prediction, linear in between. Raises ``SimulationError`` when the particles clump."""
+        """The next ``stride`` frames: one prediction, and frames between. Raises ``SimulationError`` when the particles clump.
+
+        Between, x(s) = x0 + s (x1 - x0) - s (1 - s) a / 2 with the predicted acceleration a kept between 0 and gravity: exact in free
+        flight, straight through an impact, which a parabola would carry into the wall.
+        """
         start, stride, count = self._start, self.spec.stride, self._position.shape[1]
         context = None
         if self.features.context:
@@ -326,9 +330,12 @@ class GNS(nn.Module):
             raise SimulationError(f"particles clump: {graph.edges} edges, {self.options.edge_cap:g} x the {self._first_edges} of the start exceeded")
         output = self._predict(self._position, graph, self._type, self._bounds, context)
         last = self._position[-1]
-        following = 2 * last - self._position[-2] + self.features.acceleration(output)
+        acceleration = self.features.acceleration(output)
+        following = 2 * last - self._position[-2] + acceleration
+        gravity = torch.as_tensor(start.gravity * (start.frame_step * stride) ** 2, dtype=last.dtype, device=last.device)
+        fall = acceleration.to(last.dtype).clamp(gravity.clamp(max=0), gravity.clamp(min=0))
         share = torch.arange(1, stride + 1, dtype=last.dtype, device=last.device)[:, None, None] / stride
-        frames = last + share * (following - last)
+        frames = last + share * (following - last) - share * (1 - share) / 2 * fall
         if start.kinematic is not None:
             known = np.minimum(self._present + 1 + np.arange(stride), len(start.kinematic) - 1)
             frames[:, self._type == KINEMATIC_TYPE] = torch.as_tensor(start.kinematic[known], dtype=last.dtype, device=last.device)

@@ -6,6 +6,8 @@ scene (two threads were slower than one), and bitwise reproducible.
 
 from __future__ import annotations
 
+import contextlib
+import io
 import os
 from pathlib import Path
 
@@ -29,9 +31,11 @@ def start_taichi(arch: str | None = None) -> str:
         raise ValueError(f"SLUICE_ARCH = {arch!r}: must be cpu or cuda")
     if _started is None:
         cache = Path(os.environ.get("SLUICE_TAICHI_CACHE", Path(__file__).resolve().parent.parent / ".taichi_cache"))
-        ti.init(
-            arch=getattr(ti, arch), default_fp=ti.f32, fast_math=True, cpu_max_num_threads=1, log_level=ti.ERROR,
-            offline_cache=True, offline_cache_file_path=str(cache), random_seed=0,
-        )
+        # It prints the architecture whatever the log level.
+        with contextlib.redirect_stdout(io.StringIO()):
+            ti.init(
+                arch=getattr(ti, arch), default_fp=ti.f32, fast_math=True, cpu_max_num_threads=1, log_level=ti.ERROR,
+                offline_cache=True, offline_cache_file_path=str(cache), random_seed=0,
+            )
         _started = arch
     return _started

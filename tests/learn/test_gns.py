@@ -1,6 +1,7 @@
 """GNS: the published parameter count, the textbook form as oracle, loss and rollout against hand-made truth."""
 
 import copy
+import dataclasses
 import json
 
 import numpy as np
@@ -172,7 +173,18 @@ def test_a_stride_gives_every_frame_and_the_truth_at_each_prediction():
     assert first.shape == (3, 8, 2) and first.dtype == np.float32
     np.testing.assert_allclose(first[2], truth[9], atol=1e-7)
     np.testing.assert_allclose(second[2], truth[12], atol=1e-7)
-    np.testing.assert_allclose(second[0], truth[9] + (truth[12] - truth[9]) / 3, atol=1e-7)
+    # Between, a parabola whose acceleration is the predicted one, kept between 0 and gravity.
+    fall = np.clip(truth[12] - 2 * truth[9] + truth[6], [0, -9.81 * (3 * model.spec.frame_step) ** 2], 0)
+    np.testing.assert_allclose(second[0], truth[9] + (truth[12] - truth[9]) / 3 - fall / 9, atol=1e-7)
+
+
+def test_free_flight_is_exact_between_strided_predictions():
+    step, frames = 0.0025, np.arange(40)[:, None, None]
+    truth = (0.5 + 0.002 * frames * np.array([1.0, 0.5]) - 0.5 * np.array([0, 9.81]) * (step * frames) ** 2 + np.zeros((1, 8, 1))).astype(np.float32)
+    model = small(spec(stride=4, frame_step=step), history=2)
+    model.network = Truth(model, truth[::4])
+    model.begin(dataclasses.replace(start(truth, 9), frame_step=step))
+    np.testing.assert_allclose(model.advance(), truth[9:13], atol=2e-7)
 
 
 def test_kinematic_particles_follow_their_prescription():
