@@ -102,12 +102,12 @@ def _measure(contender: Simulator, trajectory: Trajectory, settings: CompareSett
     return figures, curves
 
 
-def _plain(value: object) -> object:
+def plain(value: object) -> object:
     """JSON-able: numpy to Python, non-finite numbers to None."""
     if isinstance(value, dict):
-        return {str(key): _plain(inner) for key, inner in value.items()}
+        return {str(key): plain(inner) for key, inner in value.items()}
     if isinstance(value, list | tuple | np.ndarray):
-        return [_plain(inner) for inner in value]
+        return [plain(inner) for inner in value]
     if isinstance(value, np.generic):
         value = value.item()
     return None if isinstance(value, float) and not math.isfinite(value) else value
@@ -164,7 +164,12 @@ def _row(scene: str, contenders: list[Simulator], runs: list[dict], curves: list
         },
         "curves": {"frame": kept + 1} | bands,
     }
-    return _plain(row)
+    return plain(row)
+
+
+def known_frames(contenders: Sequence[Simulator], settings: CompareSettings) -> int:
+    """Frames that every contender is given: what the hungriest needs, so that all predict the same frames."""
+    return max([settings.history, *(getattr(contender, "history", 1) for contender in contenders)])
 
 
 def compare(contenders: Sequence[Simulator], trajectories: Sequence[Trajectory], settings: CompareSettings) -> list[dict]:
@@ -174,7 +179,7 @@ def compare(contenders: Sequence[Simulator], trajectories: Sequence[Trajectory],
     differ in ``settings["seed"]`` alone (repeated trainings); ``ValueError`` otherwise, and for trajectories without frames to predict.
     ``seconds_per_frame`` comes from these rollouts until ``attach_timing`` brings interleaved figures.
     """
-    history = max([settings.history, *(getattr(contender, "history", 1) for contender in contenders)])
+    history = known_frames(contenders, settings)
     groups: dict[str, list[Simulator]] = {}
     for contender in contenders:
         groups.setdefault(contender.name, []).append(contender)
@@ -266,6 +271,15 @@ def time_interleaved(contenders: Sequence[Simulator], start: Start, frames: int,
         )
         for index, contender in enumerate(contenders)
     ]
+
+
+def time_comparison(
+    contenders: Sequence[Simulator], trajectory: Trajectory, settings: CompareSettings, frames: int, repeats: int = 5,
+) -> list[Timing]:
+    """``time_interleaved`` from the start that ``compare`` gives, one contender a name: repeated trainings cost the same."""
+    one_each = {contender.name: contender for contender in reversed(contenders)}
+    start = start_from(trajectory, known_frames(contenders, settings))
+    return time_interleaved(list(reversed(one_each.values())), start, frames, repeats)
 
 
 def attach_timing(rows: list[dict], timings: Iterable[Timing], scene: str) -> list[dict]:
@@ -456,6 +470,14 @@ def worse_than_trivial(rows: list[dict], row: dict, yardstick: Yardstick = MOVIN
     return [name for name, bound in trivial if bound is not None and (error is None or bound < error)]
 
 
+def median_trajectory(rows: list[dict], contender: str, yardstick: Yardstick = MOVING_MSE) -> int:
+    """Number of the test trajectory on which a contender errs as in the (lower) median, failures being worst; of its first training seed."""
+    runs = next(row for row in rows if row["contender"] == contender)["spread"]["per_trajectory"]
+    runs = [run for run in runs if run["model_seed"] == runs[0]["model_seed"]]
+    errors = [math.inf if (error := yardstick.of(run)) is None else error for run in runs]
+    return sorted(range(len(errors)), key=errors.__getitem__)[(len(errors) - 1) // 2]
+
+
 def over_floor(rows: list[dict], row: dict, metric: str = "rollout_mse_moving") -> dict[str, float | None]:
     """Error over chaos floor per horizon: near 1 the rest is chance. None where there is no floor or it is zero."""
     floor = _floor(rows, row)
@@ -494,6 +516,10 @@ def analyse(rows: list[dict], yardstick: Yardstick = MOVING_MSE) -> list[dict]:
 # The verdict ----------------------------------------------------------------------------------------------------------------
 
 
+#: What a target may be relative to besides a contender: the least error of a trivial baseline.
+BEST_TRIVIAL = "best trivial"
+
+
 @dataclass(frozen=True)
 class Target:
     """A figure that a study set out to reach: low <= metric of the contender (over that of ``relative_to``, if given) <= high."""
@@ -503,7 +529,7 @@ class Target:
     yardstick: Yardstick
     high: float = math.inf
     low: float = -math.inf
-    relative_to: str | None = None
+    relative_to: str | None = None  # a contender, or ``BEST_TRIVIAL``
 
 
 def missed_targets(rows: list[dict], targets: Sequence[Target]) -> list[str]:
@@ -511,12 +537,14 @@ def missed_targets(rows: list[dict], targets: Sequence[Target]) -> list[str]:
     found = {(row["scene"], row["contender"]): row for row in rows}
     missed = []
     for target in targets:
-        row, base = found.get((target.scene, target.contender)), found.get((target.scene, target.relative_to))
+        row = found.get((target.scene, target.contender))
         value = target.yardstick.of(row) if row else None
         what = f"{target.contender} on {target.scene}: {target.yardstick}"
         if target.relative_to is not None:
             what += f" over that of {target.relative_to}"
-            divisor = target.yardstick.of(base) if base else None
+            key, wanted = ("kind", "trivial") if target.relative_to == BEST_TRIVIAL else ("contender", target.relative_to)
+            bases = [other for other in rows if other["scene"] == target.scene and other[key] == wanted]
+            divisor = min((bound for base in bases if (bound := target.yardstick.of(base)) is not None), default=None)
             value = value / divisor if value is not None and divisor else None
         if value is None:
             missed.append(f"{what} is unknown")

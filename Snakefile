@@ -1,0 +1,46 @@
+"""Sluice: from scene files to a report. ``snakemake --config study=configs/studies/demo.yaml``; options in profiles/default/config.yaml."""
+
+import os
+import sys
+
+sys.path.insert(0, workflow.basedir)
+
+from sim.errors import InputError
+from workflow.sources import code_hash
+from workflow.study import PARTS, load_study
+
+try:
+    STUDY = load_study(config.get("study", "configs/studies/smoke.yaml"))
+except InputError as error:
+    # Snakemake turns every exception into a traceback of its own; a mistake in a study is one line and exit code 2.
+    print(f"sluice: {error}", file=sys.stderr, flush=True)
+    os._exit(2)
+
+RESULTS = str(STUDY.folder)
+PYTHON = sys.executable
+
+
+include: "workflow/rules/data.smk"
+include: "workflow/rules/train.smk"
+include: "workflow/rules/compare.smk"
+include: "workflow/rules/pictures.smk"
+include: "workflow/rules/report.smk"
+
+
+wildcard_constraints:
+    data="[a-z0-9][a-z0-9_-]*",
+    part="learning|test",
+    model="[a-z0-9][a-z0-9_-]*",
+    seed=r"\d+",
+    comparison="[a-z0-9][a-z0-9_-]*",
+
+
+localrules:
+    all,
+
+
+rule all:
+    default_target: True
+    input:
+        f"{RESULTS}/report.html",
+        f"{RESULTS}/summary.json",

@@ -1,0 +1,17 @@
+"""Figures of a comparison. ``python -m workflow.scripts.figures ROWS TIMING RUN_TIME TIME ENERGY``"""
+
+import sys
+
+from learn import figures
+from workflow.rows import timed_rows
+
+
+def main(rows: str, timing: str, run_time: str, time: str, energy: str) -> None:
+    timed = timed_rows(rows, timing)
+    figures.error_over_run_time(timed, run_time)
+    figures.error_over_time(timed, time)
+    figures.kinetic_energy(timed, energy)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -1,0 +1,30 @@
+"""The rollouts to be filmed, one shard each, and their truth. ``python -m workflow.scripts.rollouts STUDY COMPARISON ROWS TRUTH SHARD ...``
+
+Filmed is the test trajectory on which the first film's contender has its median error, so that neither the best nor the worst stands for all.
+"""
+
+import json
+import sys
+from pathlib import Path
+
+from learn.compare import median_trajectory
+from learn.rollout import rollout_trajectory
+from sim.trajectory import write_shard
+from workflow.contenders import learned, test_trajectories
+from workflow.study import load_study
+
+
+def main(path: str, comparison: str, rows: str, truth: str, *shards: str) -> None:
+    study = load_study(path)
+    films = study.comparisons[comparison]["films"]
+    number = median_trajectory(json.loads(Path(rows).read_text()), films[0])
+    trajectory = test_trajectories(study, comparison)[number]
+    write_shard(truth, {number: trajectory})
+    for model, shard in zip(films, shards, strict=True):
+        contender = learned(study, comparison, model)[0]
+        simulator = {"name": model, "kind": contender.kind, "settings": contender.settings}
+        write_shard(shard, {number: rollout_trajectory(contender, trajectory, None, simulator)[0]})
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

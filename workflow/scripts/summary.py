@@ -1,0 +1,19 @@
+"""``summary.json`` and ``report.html`` of a study. ``python -m workflow.scripts.summary STUDY SUMMARY REPORT``"""
+
+import sys
+
+from learn.report import write_report
+from sim.trajectory import write_json
+from workflow.results import assets, summarise
+from workflow.study import load_study
+
+
+def main(path: str, out: str, report: str) -> None:
+    study = load_study(path)
+    summary = summarise(study)
+    write_json(out, summary)
+    write_report(summary, report, assets(study, summary))
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -1,0 +1,13 @@
+"""Loss and validation error of trainings. ``python -m workflow.scripts.training_curve OUT LABEL=RUN ...``"""
+
+import sys
+
+from learn.figures import training_curve
+
+
+def main(out: str, *runs: str) -> None:
+    training_curve(dict(run.split("=", 1) for run in runs), out)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
