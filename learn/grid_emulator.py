@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 import torch
@@ -30,6 +31,8 @@ from torch.nn import functional
 from learn.dataset import DataSpec, Windows
 from sim.simulator import Start
 from sim.trajectory import KINEMATIC_TYPE
+
+Share = Annotated[float, Field(gt=0, le=1)]
 
 
 class GridEmulatorSettings(BaseModel):
@@ -47,14 +50,12 @@ class GridEmulatorSettings(BaseModel):
     noise: float = Field(0.02, ge=0)  # std of the last input velocity's noise in velocity stds (random walk over the history)
     unroll: list[int] = Field([1, 2, 4], min_length=1)  # calls a training window spans; equal shares of the training
     walls: bool = True  # the flight that the network corrects stops at the walls; off: it goes through them
-    preview: list[int] = Field([4, 8], max_length=8)  # frames of the flight at which the network is shown the density it would lead to
+    preview: list[Share] = Field([0.5, 1.0], max_length=8)  # shares of a call after which the network is shown the density that flight leads to
     select: int = Field(0, ge=0)  # windows of a batch that are trained on, half of them drawn by how far they are from flight; 0: all
     floor: float = Field(0.03, gt=0)  # least scale of a frame's loss, in particle spacings: below it the loss would be all noise
 
     @model_validator(mode="after")
-    def _consistent(self) -> GridEmulatorSettings:
-        if any(not 1 <= frame <= self.frames_per_call for frame in self.preview):
-            raise ValueError(f"preview must be frames from 1 to frames_per_call = {self.frames_per_call}")
+    def _ascending(self) -> GridEmulatorSettings:
         if self.unroll != sorted(self.unroll) or self.unroll[0] < 1:
             raise ValueError("unroll must be ascending numbers of calls")
         return self
@@ -327,7 +328,7 @@ class GridEmulator(nn.Module):
         occupied, rows, levels = self.grid.occupy(node, examples)
         row = rows[node]
         one_hot = (kind[:, None] == self.types).to(position.dtype)
-        ahead = [self.density(flight[:, frame - 1], example, examples) for frame in self.options.preview]
+        ahead = [self.density(flight[:, max(round(share * m), 1) - 1], example, examples) for share in self.options.preview]
         sums = self.to_grid(torch.cat([one_hot, velocity.flatten(1), *ahead], 1), row, weight, len(occupied))
         mass, sums = sums.split((one_hot.shape[1], sums.shape[1] - one_hot.shape[1]), 1)
         # Isolated particles leave nodes almost without mass: the constant keeps their gradients bounded.

@@ -27,7 +27,7 @@ def spec(**changes: object) -> DataSpec:
 
 def emulator(settings: dict | None = None, **changes: object) -> GridEmulator:
     torch.manual_seed(0)
-    return GridEmulator(GridEmulatorSettings(**{"channels": [8, 8], "frames_per_call": 4, "preview": [2, 4], **(settings or {})}), spec(**changes))
+    return GridEmulator(GridEmulatorSettings(**{"channels": [8, 8], "frames_per_call": 4, **(settings or {})}), spec(**changes))
 
 
 def awaken(model: GridEmulator, size: float = 0.1) -> GridEmulator:
@@ -276,15 +276,15 @@ def test_selection_prefers_windows_far_from_flight() -> None:
     position[-1, 30:40] += 0.1
     batch = windows(position, examples=8)
     generator, seen = torch.Generator().manual_seed(0), np.zeros(8)
-    for _ in range(400):
+    for _ in range(120):
         chosen = model._select(batch, generator)
         assert chosen.examples == 2 and chosen.position.shape[1] == 20
         seen[[int(((batch.position[0] - place).abs().sum(1)).argmin()) // 10 for place in chosen.position[0, ::10]]] += 1
-    assert seen[3] > 250 and seen.min() > 30
+    assert seen[3] > 75 and seen.min() > 8
     assert model.loss(batch, generator, 0.0).item() >= 0
 
 
-@pytest.mark.parametrize("fault", [{"colour": "blue"}, {"preview": [9]}, {"unroll": [2, 1]}, {"frames_per_call": 0}])
+@pytest.mark.parametrize("fault", [{"colour": "blue"}, {"preview": [1.5]}, {"unroll": [2, 1]}, {"frames_per_call": 0}])
 def test_faulty_options_are_refused(fault: dict) -> None:
     with pytest.raises(ValidationError):
         GridEmulatorSettings(**fault)
