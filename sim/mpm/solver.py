@@ -62,7 +62,9 @@ class _Kernels:
         self.lower, self.gravity = ti.Vector.field(dim, ti.f32, ()), ti.Vector.field(dim, ti.f32, ())
         self.E = ti.Vector.field(4, ti.f32, 3)
         self.state = [self.x, self.v, *self.C, *(field for material in self.materials for field in material.fields())]
-        self.saved = [ti.field(ti.f32, capacity) if isinstance(field, ti.ScalarField) else ti.Vector.field(field.n, ti.f32, capacity) for field in self.state]
+        self.saved = [
+            ti.field(ti.f32, capacity) if isinstance(field, ti.ScalarField) else ti.Vector.field(field.n, ti.f32, capacity) for field in self.state
+        ]
         self.frame = self.frame_serial if serial else self.frame_parallel
 
     @ti.func
@@ -218,7 +220,7 @@ class _Kernels:
         for p in range(keep * self.range[ti.static(len(self.models))]):
             self.save_particle(p)
         ti.loop_config(serialize=True)
-        for s in range(substeps):
+        for _ in range(substeps):
             low, high = ti.Vector([1 << 20] * self.dim), ti.Vector([0] * self.dim)
             for m in ti.static(range(len(self.models))):
                 for p in range(self.range[m], self.range[m + 1]):
@@ -385,7 +387,8 @@ class MPMSimulator:
         self._scene, self._tracked = scene, particles.tracked
         position = particles.position
         if self.settings["perturbation"]:
-            position = position + np.random.default_rng(np.random.SeedSequence([scene.seed, 2])).normal(size=position.shape) * self.settings["perturbation"]
+            noise = np.random.default_rng(np.random.SeedSequence([scene.seed, 2])).normal(size=position.shape)
+            position = position + self.settings["perturbation"] * noise
         # Where a wall stops particles during the run, it also holds the start.
         cell = np.clip((position - lower) / self.dx + WALL, WALL + HAIR, WALL + cells - HAIR)
         data = np.ascontiguousarray(np.concatenate([cell, particles.velocity], 1).astype(np.float32))
@@ -470,8 +473,9 @@ class MPMSimulator:
     def _run(self, substeps: int, dt: float, keep: bool) -> np.ndarray:
         sums = np.zeros(SUMS)
         self._kernels.frame(substeps, dt, int(keep), self._position, sums)
+        kinetic, potential, elastic = sums[:3].tolist()
         self._diagnostics = {
-            **dict(zip(("kinetic_energy", "potential_energy", "elastic_energy"), sums[:3].tolist(), strict=True)), "max_speed": float(np.sqrt(sums[3])),
+            "kinetic_energy": kinetic, "potential_energy": potential, "elastic_energy": elastic, "max_speed": float(np.sqrt(sums[3])),
             "wave_speed": float(sums[4]), "substeps": float(substeps), "dt": dt,
         }
         return sums
