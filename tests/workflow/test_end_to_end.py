@@ -1,0 +1,145 @@
+"""One study from nothing to its report; what an edit makes again; resuming after kill -9."""
+
+import json
+import os
+import re
+import signal
+import time
+from pathlib import Path
+
+import pytest
+from study_tree import begin_snakemake, planned, snakemake
+
+pytestmark = pytest.mark.workflow
+
+ROW_KEYS = {
+    "scene", "contender", "kind", "settings", "one_step_mse", "rollout_mse", "rollout_mse_moving", "seconds_per_frame",
+    "seconds_per_simulated_second", "compile_seconds", "spread",
+}
+KINDS = {"reference": 1, "solver": 2, "learned": 2, "trivial": 5, "oracle": 1, "floor": 1}
+PICTURES = {"figures", "film", "strip", "training_curve"}
+
+
+def refuse(constant: str):
+    raise ValueError(f"{constant} is not JSON")
+
+
+@pytest.fixture(scope="module")
+def summary(finished) -> dict:
+    return json.loads((finished / "results" / "micro" / "summary.json").read_text(), parse_constant=refuse)
+
+
+def test_summary_holds_what_it_promises(summary):
+    assert {"rows", "hardware", "versions", "verdict", "analysis"} <= summary.keys()
+    rows = summary["rows"]
+    assert {kind: sum(row["kind"] == kind for row in rows) for kind in KINDS} == KINDS
+    assert len({row["contender"] for row in rows}) == len(rows) == sum(KINDS.values())
+    for row in rows:
+        assert row.keys() >= ROW_KEYS and row["scene"] == "puddle"
+        for key in ("rollout_mse", "rollout_mse_moving"):
+            assert list(row[key]) == ["1", "5", "all"]
+        assert len(row["spread"]["per_trajectory"]) == 2
+    assert summary["hardware"]["cpu"] and summary["versions"]["taichi"]
+
+
+def test_the_yardsticks_are_in_order(summary):
+    rows = {row["contender"]: row for row in summary["rows"]}
+    assert rows["teacher"]["rollout_mse"]["all"] == 0
+    assert rows["oracle"]["rollout_mse"]["all"] < 1e-12
+    assert rows["cfl 0.8"]["rollout_mse"]["all"] > 0
+    for name in ("teacher", "cfl 0.8", "grid 2x coarser", "gns", "grid", "ballistic"):
+        assert rows[name]["timing_spread"]["n"] == 5, name
+    for name in ("gns", "grid"):
+        assert rows[name]["settings"]["seeds"] == [0]
+        assert rows[name]["cost"]["trajectories"] == 2 and rows[name]["cost"]["training_seconds"] > 0
+    assert "Missed: gns on puddle" in summary["verdict"]
+
+
+def test_the_report_stands_alone(finished, summary):
+    page = (finished / "results" / "micro" / "report.html").read_text()
+    text = re.sub(r"<[^>]+>|\s+", " ", page)
+    assert summary["verdict"][:60] in text.replace("&#39;", "'")
+    assert not re.findall(r"""(?:src|href|poster)=["'](?!data:|#)""", page) and "<script" not in page and "@import" not in page
+    assert page.count("data:video/mp4") == 1 and page.count("data:image/svg+xml") >= 4 and page.count("data:image/png") >= 2
+
+
+def test_every_job_leaves_log_and_benchmark(finished):
+    results = finished / "results" / "micro"
+    logs = {path.relative_to(results / "logs").with_suffix("") for path in (results / "logs").rglob("*.log")}
+    benchmarks = {path.relative_to(results / "benchmarks").with_suffix("") for path in (results / "benchmarks").rglob("*.tsv")}
+    assert logs == benchmarks and len(logs) == 12
+
+
+def test_nothing_is_made_twice(finished):
+    assert planned(finished) == {}
+
+
+# What an edit makes again: a dry run on a copy of the finished tree ---------------------------------------------------------
+
+
+def append(path: Path, text: str = "\nEDITED = True\n") -> None:
+    path.write_text(path.read_text() + text)
+
+
+def replace(path: Path, old: str, new: str) -> None:
+    assert old in path.read_text()
+    path.write_text(path.read_text().replace(old, new, 1))
+
+
+EDITS = {
+    "solver": (lambda tree: append(tree / "sim" / "mpm" / "solver.py"), {"data", "train", "errors", "timing", "rollouts", "report", *PICTURES}),
+    "comment": (lambda tree: append(tree / "sim" / "mpm" / "solver.py", "\n# a comment\n"), set()),
+    "network": (lambda tree: append(tree / "learn" / "gns.py"), {"train", "errors", "timing", "rollouts", "report", *PICTURES}),
+    "figures": (lambda tree: append(tree / "learn" / "figures.py"), {"figures", "training_curve", "report"}),
+    "report": (lambda tree: append(tree / "learn" / "report.py"), {"report"}),
+    "target": (lambda tree: replace(tree / "configs" / "studies" / "micro.yaml", "1.0e-12", "1.0"), {"report"}),
+    "rung": (
+        lambda tree: replace(tree / "configs" / "studies" / "micro.yaml", "cfl: 0.8", "cfl: 0.9"),
+        {"errors", "timing", "rollouts", "figures", "film", "strip", "report"},
+    ),
+}
+
+
+@pytest.mark.parametrize("name", EDITS)
+def test_an_edit_makes_again_what_it_must(copied, name):
+    change, expected = EDITS[name]
+    change(copied)
+    jobs = planned(copied)
+    assert set(jobs) == expected
+    if name == "network":
+        assert jobs["train"] == 1  # the other model is as it was
+
+
+# Resuming -------------------------------------------------------------------------------------------------------------------
+
+
+def kill_when(tree: Path, ready) -> None:
+    """Start the micro study and end the whole group by SIGKILL, as a power cut would, once ``ready()``."""
+    process = begin_snakemake(tree)
+    try:
+        deadline = time.monotonic() + 600
+        while not ready():
+            assert process.poll() is None and time.monotonic() < deadline, process.stdout.read()
+            time.sleep(0.02)
+    finally:
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+        process.stdout.close()
+
+
+def test_resume_after_kill_9(tree):
+    results = tree / "results" / "micro"
+    run = results / "training" / "gns" / "seed-0"
+    kill_when(tree, lambda: (run / "checkpoint.pt").exists())
+    assert not (results / "models" / "gns" / "seed-0.pt").exists()
+    rows = (run / "log.csv").read_text().splitlines()[:4]
+    shards = {path: path.stat().st_mtime_ns for path in results.rglob("shard-*.h5")}
+    assert len(rows) == 4 and shards
+    code, output = snakemake(tree)
+    assert code != 0 and "lock" in output  # Snakemake cannot know that the other one is dead; make resume unlocks first
+    assert snakemake(tree, "--unlock")[0] == 0
+    code, output = snakemake(tree, f"{results.relative_to(tree)}/models/gns/seed-0.pt")
+    assert code == 0, output
+    assert (run / "log.csv").read_text().splitlines()[:4] == rows  # it went on, times and all, instead of beginning again
+    assert json.loads((results / "models" / "gns" / "seed-0.json").read_text())["steps"] == 300
+    assert {path: path.stat().st_mtime_ns for path in shards} == shards

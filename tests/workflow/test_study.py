@@ -1,0 +1,234 @@
+"""Studies: the shipped ones are sound and resolve; every mistake is one line with file, key, value and remedy, and nothing is written."""
+
+from pathlib import Path
+
+import pytest
+import yaml
+from study_tree import ROOT, make_tree, planned, snakemake
+
+from sim.errors import InputError
+from workflow.study import load_study
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory) -> Path:
+    """A tree for tests that run nothing."""
+    folder = make_tree(tmp_path_factory.mktemp("study") / "tree")
+    shipped = folder / "pretrained" / "waterdrop_gns" / "best.pt"
+    shipped.parent.mkdir(parents=True)
+    shipped.touch()
+    return folder
+
+
+def write(folder: Path, change, name: str = "changed") -> str:
+    """The micro study, changed in place by ``change``, as a new study; its path."""
+    content = yaml.safe_load((folder / "configs" / "studies" / "micro.yaml").read_text())
+    change(content)
+    path = Path("configs/studies") / f"{name}.yaml"
+    (folder / path).write_text(yaml.safe_dump(content))
+    return str(path)
+
+
+def put(*keys, value):
+    """A change that sets ``content[keys[0]][keys[1]]... = value``."""
+
+    def change(content):
+        for key in keys[:-1]:
+            content = content[key]
+        content[keys[-1]] = value
+
+    return change
+
+
+def drop(*keys):
+    def change(content):
+        for key in keys[:-1]:
+            content = content[key]
+        del content[keys[-1]]
+
+    return change
+
+
+COMPARISON = ("comparisons", "puddle")
+MISTAKES = [
+    (put("colour", value=1), "colour = 1: unknown key; the keys here are comparisons, data, models, title"),
+    (put("data", "puddle", "tests", value=3), "data.puddle.tests = 3: unknown key"),
+    (put("data", "puddle", "train", value="two"), "data.puddle.train = 'two': must be of type integer"),
+    (put("data", "puddle", "train", value=-1), "data.puddle.train = -1"),
+    (put("data", "puddle", "train", value=0), "data.puddle.train = 0: gns is trained on this data"),
+    (put("data", "puddle", "scene", value="configs/scenes/no.yaml"), "data.puddle.scene = 'configs/scenes/no.yaml': no such file"),
+    (put("data", "puddle", "variant", value="stiff"), "variant = 'stiff': not among the variants"),
+    (put("data", "Pud dle", value={"scene": "configs/scenes/puddle.yaml"}), "use small letters"),
+    (put("data", "puddle", value=None), "data.puddle = None: must be of type object"),
+    (drop("data"), "data = None: missing; add it"),
+    (drop("models", "gns", "seeds"), "models.gns = ['config', 'data']: give config, data and seeds"),
+    (put("models", "gns", "checkpoint", value="a.pt"), "give config, data and seeds"),
+    (put("models", "gns", value={"checkpoint": "no.pt"}), "models.gns.checkpoint = 'no.pt': no such file"),
+    (put("models", "gns", "config", value="no.yaml"), "models.gns.config = 'no.yaml': no such file"),
+    (put("models", "gns", "config", value="configs/scenes/puddle.yaml"), "model = None: must be one of gns, grid_emulator"),
+    (put("models", "gns", "data", value="pond"), "models.gns.data = 'pond': not among data: puddle"),
+    (put("models", "gns", "seeds", value=[0, 0]), "models.gns.seeds"),
+    (put(*COMPARISON, "data", value="pond"), "comparisons.puddle.data = 'pond': not among data: puddle"),
+    (put(*COMPARISON, "trajectories", value=3), "comparisons.puddle.trajectories = 3: data.puddle.test is only 2"),
+    (put(*COMPARISON, "learned", value=["gsn"]), "comparisons.puddle.learned = 'gsn': not among gns, grid"),
+    (put(*COMPARISON, "films", value=["gsn"]), "comparisons.puddle.films = 'gsn': not among gns, grid"),
+    (put(*COMPARISON, "timing", "repeats", value=2), "comparisons.puddle.timing.repeats = 2: a median and a spread need at least 5"),
+    (put(*COMPARISON, "ladder", 0, "name", value="frozen"), "comparisons.puddle.ladder[0].name = 'frozen': another contender has this name"),
+    (put(*COMPARISON, "ladder", 0, value={"name": "a"}), "comparisons.puddle.ladder[0] = ['name']: name what the rung changes"),
+    (put(*COMPARISON, "ladder", 0, value={"name": "a", "coarsen": 2.0}), "comparisons.puddle.ladder[0].coarsen = 2.0: a coarser grid needs"),
+    (put(*COMPARISON, "ladder", 0, "cfl", value=0), "comparisons.puddle.ladder[0].cfl = 0"),
+    (put(*COMPARISON, "targets", 0, "metric", value="beauty"), "comparisons.puddle.targets[0].metric = 'beauty'"),
+    (drop(*COMPARISON, "targets", 0, "high"), "give contender, metric and at least one of high and low"),
+    (put(*COMPARISON, "targets", 0, "relative_to", value="nobody"), "targets[0].relative_to = 'nobody': not among"),
+    (lambda content: content["comparisons"].update(again=content["comparisons"]["puddle"]), "two comparisons share this one"),
+]
+
+
+@pytest.mark.parametrize(("change", "line"), MISTAKES)
+def test_mistakes_are_named(place, monkeypatch, change, line):
+    monkeypatch.chdir(place)
+    with pytest.raises(InputError) as error:
+        load_study(write(place, change))
+    assert line in str(error.value) and "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("text", ["", "- a\n- b", "title: [", "title: a\ntitle: b", "data: 3", "\0"])
+def test_files_that_are_no_study(place, monkeypatch, text):
+    monkeypatch.chdir(place)
+    path = Path("configs/studies/odd.yaml")
+    path.write_text(text)
+    with pytest.raises(InputError, match="odd.yaml"):
+        load_study(path)
+
+
+def test_no_such_file_and_names_that_are_no_folder(place, monkeypatch):
+    monkeypatch.chdir(place)
+    with pytest.raises(InputError, match="No such file"):
+        load_study("configs/studies/none.yaml")
+    with pytest.raises(InputError, match="rename it"):
+        load_study("configs/studies/My Study.yaml")
+
+
+@pytest.mark.workflow
+def test_a_mistake_is_one_line_exit_2_and_nothing_written(tree):
+    study = write(tree, put("data", "puddle", "tests", value=3))
+    before = {path: path.stat().st_mtime_ns for path in tree.rglob("*") if "__pycache__" not in path.parts}
+    code, output = snakemake(tree, study=study)
+    lines = [line for line in output.splitlines() if line.strip()]
+    assert code == 2
+    assert [line for line in lines if line.startswith("sluice: ")] == [lines[-1]] and "data.puddle.tests = 3" in lines[-1]
+    assert "Traceback" not in output and len(lines) <= 2  # Snakemake names the profile it uses
+    assert not (tree / "results").exists()
+    assert before.keys() == {path for path in tree.rglob("*") if not {"__pycache__", ".snakemake"} & set(path.parts)}
+
+
+@pytest.mark.workflow
+@pytest.mark.parametrize("name", sorted(path.stem for path in (ROOT / "configs" / "studies").glob("*.yaml")))
+def test_shipped_studies_resolve(place, name):
+    jobs = planned(place, study=f"configs/studies/{name}.yaml")
+    content = yaml.safe_load((place / "configs" / "studies" / f"{name}.yaml").read_text())
+    comparisons, models = content["comparisons"].values(), content["models"].values()
+    assert all(len(entry["ladder"]) >= 5 for entry in comparisons)
+    assert jobs["errors"] == jobs["timing"] == jobs["figures"] == len(comparisons) and jobs["report"] == 1
+    assert jobs.get("train", 0) == sum(len(model.get("seeds", [])) for model in models)
+
+
+def test_the_paper_study_is_the_papers_size():
+    study = load_study(ROOT / "configs" / "studies" / "paper.yaml") if Path.cwd() == ROOT else None
+    if study is None:
+        pytest.skip("paths of a study are relative to the root of the repository")
+    (data,) = study.data.values()
+    assert (data["train"], data["valid"], data["test"]) == (1000, 30, 30)
+    assert study.families["waterdrop"].model.frames == 1001
+    config = study.configs["gns"]
+    assert (config["settings"]["latent"], config["settings"]["message_passing"], config["training"]["batch"]) == (128, 10, 2)
+    assert float(config["settings"]["noise"]) == 6.7e-4
+
+
+def test_one_study_keeps_nothing_of_another(place, monkeypatch):
+    """The trap of ``--configfile``: a small study that silently has the large one's scenes as well."""
+    monkeypatch.chdir(place)
+    assert set(load_study("configs/studies/micro.yaml").data) == {"puddle"}
+    folders = {load_study(f"configs/studies/{name}.yaml").folder for name in ("micro", "smoke", "paper")}
+    assert len(folders) == 3
+
+
+# Recipes: what makes results again ------------------------------------------------------------------------------------------
+
+
+def recipes(folder: Path) -> dict[str, str]:
+    """All recipes of the micro study, in a fresh interpreter's view of the sources."""
+    import subprocess
+    import sys
+
+    program = """
+import json
+from workflow.study import load_study
+study = load_study("configs/studies/micro.yaml")
+made = {f"data {part}": study.data_recipe("puddle", part) for part in ("learning", "test")}
+made |= {f"train {model}": study.train_recipe(model, 0) for model in ("gns", "grid")}
+made |= {script: study.comparison_recipe("puddle", ("ladder", "learned"), script) for script in ("errors", "timing")}
+print(json.dumps(made | {"report": study.report_recipe()}))
+"""
+    answer = subprocess.run([sys.executable, "-c", program], cwd=folder, capture_output=True, text=True)
+    assert answer.returncode == 0, answer.stderr
+    return yaml.safe_load(answer.stdout)
+
+
+def edit(path: Path, old: str, new: str) -> None:
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+
+
+LEARNED, COMPARED = {"train gns", "train grid"}, {"errors", "timing"}
+EDITS = [
+    # A solver's source: its data, all that is trained on them, all that is compared with it.
+    ("sim/mpm/walls.py", None, {"data learning", "data test", *LEARNED, *COMPARED}),
+    ("sim/mpm/solver.py", None, {"data learning", "data test", *LEARNED, *COMPARED}),
+    ("learn/gns.py", None, {"train gns", *COMPARED}),
+    ("learn/grid_emulator.py", None, {"train grid", *COMPARED}),
+    ("learn/train.py", None, LEARNED),
+    ("learn/compare.py", None, COMPARED | {"report"}),
+    ("learn/report_template.html", None, {"report"}),
+    ("learn/figures.py", None, set()),
+    ("sim/render.py", None, set()),
+    ("sim/cli.py", None, set()),
+    ("configs/scenes/puddle.yaml", ("sound_speed: 6.0", "sound_speed: 7.0"), {"data learning", "data test", *LEARNED}),
+    ("configs/scenes/puddle.yaml", ("splits: {train: 2", "splits: {train: 9"), set()),
+    ("configs/models/micro_gns.yaml", ("latent: 8", "latent: 9"), {"train gns"}),
+    ("configs/studies/micro.yaml", ("test: 2", "test: 3"), {"data test", "report"}),
+    ("configs/studies/micro.yaml", ("train: 2", "train: 3"), {"data learning", *LEARNED, "report"}),
+    ("configs/studies/micro.yaml", ("cfl: 0.8", "cfl: 0.9"), COMPARED | {"report"}),
+    ("configs/studies/micro.yaml", ("high: 1.0e-12", "high: 1.0"), {"report"}),
+]
+
+
+@pytest.fixture(scope="module")
+def untouched(place) -> dict[str, str]:
+    return recipes(place)
+
+
+@pytest.mark.parametrize(("file", "change", "expected"), EDITS, ids=lambda value: value if isinstance(value, str) else None)
+def test_an_edit_changes_the_recipes_it_must(place, untouched, file, change, expected):
+    path = place / file
+    original = path.read_bytes()
+    try:
+        if change is None:
+            path.write_text(path.read_text() + ("\nEDITED = True\n" if path.suffix == ".py" else "<!-- edited -->"))
+        else:
+            edit(path, *change)
+        after = recipes(place)
+    finally:
+        path.write_bytes(original)
+    assert {name for name in after if after[name] != untouched[name]} == expected
+
+
+def test_comments_and_docstrings_change_no_recipe(place, untouched):
+    path = place / "sim" / "mpm" / "solver.py"
+    original = path.read_text()
+    try:
+        path.write_text('"""Another docstring."""\n' + original[original.index('"""', 3) + 3 :] + "\n# a comment\n")
+        assert recipes(place) == untouched
+    finally:
+        path.write_text(original)
