@@ -29,7 +29,6 @@ include: "workflow/rules/report.smk"
 
 wildcard_constraints:
     data="[a-z0-9][a-z0-9_-]*",
-    part="learning|test",
     model="[a-z0-9][a-z0-9_-]*",
     seed=r"\d+",
     comparison="[a-z0-9][a-z0-9_-]*",

@@ -221,6 +221,8 @@ def _config(path: Path, content: dict, name: str, entry: dict) -> dict:
     model = config.get("model") if isinstance(config, dict) else None
     if model not in registered_models():
         raise InputError(entry["config"], "model", model, f"must be one of {', '.join(sorted(registered_models()))}")
+    if not isinstance(config.get("training"), dict):
+        raise InputError(entry["config"], "training", config.get("training"), "must be a mapping with a budget; see configs/models/")
     data = content["data"].get(entry["data"])
     if data is None:
         raise InputError(path, f"{where}.data", entry["data"], f"not among data: {', '.join(sorted(content['data']))}")

@@ -4,7 +4,7 @@ ERROR_KEYS = ("data", "trajectories", "horizons", "ladder", "learned")
 TIMING_KEYS = ("data", "trajectories", "ladder", "learned", "timing")
 
 
-def test_data(wildcards):
+def truth(wildcards):
     return STUDY.data_stamp(STUDY.comparisons[wildcards.comparison]["data"], "test")
 
 
@@ -14,7 +14,7 @@ def learned_models(wildcards):
 
 rule errors:
     input:
-        data=test_data,
+        data=truth,
         models=learned_models,
     output:
         f"{RESULTS}/comparisons/{{comparison}}/errors.json",
@@ -36,7 +36,7 @@ rule errors:
 
 rule timing:
     input:
-        data=test_data,
+        data=truth,
         models=learned_models,
     output:
         f"{RESULTS}/comparisons/{{comparison}}/timing.json",

@@ -8,7 +8,7 @@ def film_shards(wildcards):
 
 rule rollouts:
     input:
-        data=test_data,
+        data=truth,
         models=learned_models,
         rows=f"{RESULTS}/comparisons/{{comparison}}/errors.json",
     output:

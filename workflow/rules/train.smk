@@ -27,7 +27,6 @@ rule train:
         mem_mb=4000,
         runtime=lambda wildcards: int(2 * STUDY.budget(wildcards.model).get("minutes", training("minutes", 600)(wildcards)) + 10),
         gpu=lambda wildcards: int(training("device", "auto")(wildcards) == "cuda"),
-    # The longest jobs of a study go first, so that the others fill the cores beside them.
     priority: 100
     message:
         "Training {wildcards.model}, seed {wildcards.seed} (progress in {log})"
