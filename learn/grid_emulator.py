@@ -111,6 +111,8 @@ class StencilConv(nn.Module):
 
     def forward(self, x: Tensor, neighbours: Tensor) -> Tensor:
         """[A, C_in], [A, 3^d] -> [A, C_out]."""
+        if not torch.is_grad_enabled():  # autograd's bookkeeping costs as much as a small convolution
+            return torch.addmm(self.bias, _gather(x, neighbours), self.weight.view(-1, self.weight.shape[2]))
         return _StencilConv.apply(x, self.weight, self.bias, neighbours)
 
 
@@ -261,6 +263,8 @@ class GridEmulator(nn.Module):
         self.register_buffer("corners", torch.tensor(list(itertools.product((0, 1), repeat=dim))), persistent=False)
         self.register_buffer("nodes", torch.tensor(nodes), persistent=False)
         self.register_buffer("types", torch.tensor(spec.particle_types), persistent=False)
+        previewed = [max(round(share * m), 1) - 1 for share in settings.preview]
+        self.register_buffer("previewed", torch.tensor(previewed, dtype=torch.int64), persistent=False)
         self.register_buffer("frame", torch.arange(1, m + 1)[:, None].float(), persistent=False)
         self.fixed = KINEMATIC_TYPE in spec.particle_types
         self.context = 0 if spec.context_mean is None else len(spec.context_mean)
@@ -311,10 +315,11 @@ class GridEmulator(nn.Module):
         return torch.cat(parts, 1)
 
     def density(self, position: Tensor, example: Tensor, examples: int) -> Tensor:
-        """[N, 1]: density, 1 in the bulk, that the particles at ``position`` [N, d] see at their places: sum_i w_ip m sum_q w_iq."""
-        node, weight = self.weights(position, example)
-        grid = weight.new_zeros(examples * self.grid.sizes[0]).index_add(0, node.reshape(-1), weight.reshape(-1))
-        return (grid[node] * weight).sum(1, keepdim=True) * self.particle_mass
+        """[N, k]: density, 1 in the bulk, that particles see among themselves at k sets of places [k, N, d]: sum_i w_ip m sum_q w_iq."""
+        sets = len(position)
+        node, weight = self.weights(position.flatten(0, 1), (example + examples * torch.arange(sets, device=example.device)[:, None]).flatten())
+        grid = weight.new_zeros(sets * examples * self.grid.sizes[0]).index_add(0, node.reshape(-1), weight.reshape(-1))
+        return (grid.index_select(0, node.reshape(-1)).view_as(weight) * weight).sum(1).view(sets, position.shape[1]).t() * self.particle_mass
 
     def call(self, history: Tensor, kind: Tensor, example: Tensor, examples: int, context: Tensor | None = None) -> Tensor:
         """The next m positions [m, N, d] of a history [history, N, d]; context [examples, c]. Kinematic particles come out unprescribed."""
@@ -328,11 +333,11 @@ class GridEmulator(nn.Module):
         occupied, rows, levels = self.grid.occupy(node, examples)
         row = rows[node]
         one_hot = (kind[:, None] == self.types).to(position.dtype)
-        ahead = [self.density(flight[:, max(round(share * m), 1) - 1], example, examples) for share in self.options.preview]
-        sums = self.to_grid(torch.cat([one_hot, velocity.flatten(1), *ahead], 1), row, weight, len(occupied))
+        ahead = self.density(flight.index_select(1, self.previewed).transpose(0, 1), example, examples)
+        sums = self.to_grid(torch.cat([one_hot, velocity.flatten(1), ahead], 1), row, weight, len(occupied))
         mass, sums = sums.split((one_hot.shape[1], sums.shape[1] - one_hot.shape[1]), 1)
         # Isolated particles leave nodes almost without mass: the constant keeps their gradients bounded.
-        mean, ahead = (sums / (mass.sum(1, keepdim=True) + 1e-3)).split((velocity.shape[1] * dim, len(ahead)), 1)
+        mean, ahead = (sums / (mass.sum(1, keepdim=True) + 1e-3)).split((velocity.shape[1] * dim, ahead.shape[1]), 1)
         mean = mean.view(-1, *velocity.shape[1:])
         output = self.network(self.node_features(occupied, mass * self.particle_mass, mean, ahead, context), levels)
         read = self.to_particles(torch.cat([output, mean[:, 0]], 1), row, weight)

@@ -127,7 +127,7 @@ def test_coarser_levels_hold_the_parents() -> None:
 @pytest.mark.parametrize("dim", [2, 3])
 def test_untrained_model_flies_ballistically(dim: int) -> None:
     gravity = (*GRAVITY, 0.0)[:dim]
-    model = emulator({"history": 3}, dim=dim, bounds=((0.0, 1.0),) * dim, gravity=gravity, **{
+    model = emulator({"history": 3, "preview": []}, dim=dim, bounds=((0.0, 1.0),) * dim, gravity=gravity, **{
         name: (1e-3,) * dim for name in ("velocity_mean", "velocity_std", "acceleration_mean", "acceleration_std")
     })
     truth = flight(40, 23, dim, gravity=gravity)
@@ -265,9 +265,10 @@ def test_density_is_one_in_the_bulk() -> None:
     model = emulator()
     axis = torch.arange(20) * 0.05 + 0.025
     position = torch.cartesian_prod(axis, axis)
-    density = model.density(position, torch.zeros(400, dtype=torch.long), 1)
+    density = model.density(torch.stack([position, position + 5]), torch.zeros(400, dtype=torch.long), 1)
     middle = (position - 0.5).abs().max(1).values < 0.3
-    assert torch.allclose(density[middle], torch.ones(1), atol=1e-3)
+    assert torch.allclose(density[middle, 0], torch.ones(1), atol=1e-3)
+    assert density[:, 1].abs().max() == 0  # all beyond the grid
 
 
 def test_selection_prefers_windows_far_from_flight() -> None:
