@@ -292,6 +292,13 @@ def pile_angle(position: np.ndarray, bounds: np.ndarray, gravity: np.ndarray, sp
 # All of it ------------------------------------------------------------------------------------------------------------------
 
 
+#: What ``cloud_metrics`` measures, in its order.
+CLOUD_METRICS = (
+    "sinkhorn", "emd", "spacing_ratio", "density_error_mean", "density_error_max", "centre_of_mass_error", "front_error", "width_ratio",
+    "height_ratio", "pile_angle_error",
+)
+
+
 def cloud_metrics(p: np.ndarray, q: np.ndarray, trajectory: Trajectory, *, emd_particles: int = 500, sinkhorn_particles: int = 300) -> dict:
     """Every cloud metric of one predicted frame p against the true one q, both [particles, dim], moving particles; NaN if p is not finite.
 
@@ -299,12 +306,8 @@ def cloud_metrics(p: np.ndarray, q: np.ndarray, trajectory: Trajectory, *, emd_p
     ``front_error``, ``centre_of_mass_error`` and ``emd`` in spacings, ``pile_angle_error`` in degrees.
     """
     spacing, bounds, gravity = float(trajectory.scene["spacing"]), trajectory.bounds, np.asarray(trajectory.scene["gravity"], float)
-    names = (
-        "sinkhorn", "emd", "spacing_ratio", "density_error_mean", "density_error_max", "centre_of_mass_error", "front_error",
-        "width_ratio", "height_ratio", "pile_angle_error",
-    )
     if not np.isfinite(p).all():
-        return dict.fromkeys(names, math.nan)
+        return dict.fromkeys(CLOUD_METRICS, math.nan)
 
     def ratio(predicted: float | None, true: float | None) -> float | None:
         return None if predicted is None or not true else predicted / true
@@ -324,7 +327,7 @@ def cloud_metrics(p: np.ndarray, q: np.ndarray, trajectory: Trajectory, *, emd_p
         ratio(pile_height(p, bounds, gravity), pile_height(q, bounds, gravity)),
         None if None in angles else abs(angles[0] - angles[1]),
     )
-    return dict(zip(names, values, strict=True))
+    return dict(zip(CLOUD_METRICS, values, strict=True))
 
 
 def evaluate(

@@ -18,6 +18,7 @@ from jsonschema import Draft202012Validator
 from jsonschema.exceptions import ValidationError, relevance
 
 from learn.compare import BEST_TRIVIAL
+from learn.metrics import CLOUD_METRICS, CLOUD_TIMES
 from sim.errors import InputError
 from sim.scene import SceneFamily, read_yaml
 from workflow.names import FLOOR, ORACLE, REFERENCE, TRIVIAL
@@ -253,6 +254,14 @@ def _check_comparison(study: Study, name: str, entry: dict) -> None:
         for key in ("contender", "relative_to"):
             if key in target and target[key] not in [*names, BEST_TRIVIAL]:
                 raise InputError(path, f"{where}.targets[{index}].{key}", target[key], f"not among {', '.join([*names, BEST_TRIVIAL])}")
+        metric, at = target["metric"], str(target["at"]) if "at" in target else None
+        if metric.startswith("rollout_mse"):
+            moments = [str(horizon) for horizon in entry["horizons"]] + ["all"]
+        else:
+            moments = [f"{share:g}" for share in CLOUD_TIMES] if metric in CLOUD_METRICS else [None]
+        if at not in moments:
+            remedy = f"{metric} is known at {', '.join(moments)}" if moments[0] else f"{metric} is one figure; leave it out"
+            raise InputError(path, f"{where}.targets[{index}].at", target.get("at"), remedy)
 
 
 def rung_settings(rung: dict) -> dict:

@@ -85,7 +85,7 @@ def begin_snakemake(folder: Path, *options: str, study: str = "configs/studies/m
     """Snakemake in a tree, in a process group of its own."""
     # Compiled kernels are shared with the checkout: what is tested is the workflow, not the compiler.
     environment = os.environ | {"SLUICE_TAICHI_CACHE": str(ROOT / ".taichi_cache")}
-    command = [sys.executable, "-m", "snakemake", "--cores", "2", "--config", f"study={study}", *options]
+    command = [sys.executable, "-m", "snakemake", "--cores", "2", *options, "--config", f"study={study}"]
     return subprocess.Popen(
         command, cwd=folder, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True
     )

@@ -87,7 +87,10 @@ def replace(path: Path, old: str, new: str) -> None:
 
 
 EDITS = {
-    "solver": (lambda tree: append(tree / "sim" / "mpm" / "solver.py"), {"learning_data", "test_data", "train", "errors", "timing", "rollouts", "report", *PICTURES}),
+    "solver": (
+        lambda tree: append(tree / "sim" / "mpm" / "solver.py"),
+        {"learning_data", "test_data", "train", "errors", "timing", "rollouts", "report", *PICTURES},
+    ),
     "comment": (lambda tree: append(tree / "sim" / "mpm" / "solver.py", "\n# a comment\n"), set()),
     "network": (lambda tree: append(tree / "learn" / "gns.py"), {"train", "errors", "timing", "rollouts", "report", *PICTURES}),
     "figures": (lambda tree: append(tree / "learn" / "figures.py"), {"figures", "training_curve", "report"}),

@@ -80,6 +80,10 @@ MISTAKES = [
     (put(*COMPARISON, "targets", 0, "metric", value="beauty"), "comparisons.puddle.targets[0].metric = 'beauty'"),
     (drop(*COMPARISON, "targets", 0, "high"), "give contender, metric and at least one of high and low"),
     (put(*COMPARISON, "targets", 0, "relative_to", value="nobody"), "targets[0].relative_to = 'nobody': not among"),
+    (put(*COMPARISON, "targets", 0, "at", value=20), "targets[0].at = 20: rollout_mse_moving is known at 1, 5, all"),
+    (drop(*COMPARISON, "targets", 0, "at"), "targets[0].at = None: rollout_mse_moving is known at"),
+    (put(*COMPARISON, "targets", 0, "metric", value="emd"), "targets[0].at = 'all': emd is known at 0.25, 0.5, 0.75, 1"),
+    (put(*COMPARISON, "targets", 0, "metric", value="escaped_fraction"), "targets[0].at = 'all': escaped_fraction is one figure; leave it out"),
     (lambda content: content["comparisons"].update(again=content["comparisons"]["puddle"]), "two comparisons share this one"),
 ]
 

@@ -21,4 +21,4 @@ def missing() -> list[str]:
 
 if __name__ == "__main__":
     if absent := missing():
-        print(f"{', '.join(absent)} missing: pictures will be drawn flat, by matplotlib. For lit ones: {GL_REMEDY} (or: make system)", file=sys.stderr)
+        print(f"{', '.join(absent)} missing: pictures will be drawn flat. For lit spheres: {GL_REMEDY} (or: make system)", file=sys.stderr)
