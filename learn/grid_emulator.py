@@ -29,6 +29,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from learn.dataset import DataSpec, Windows
+from learn.features import random_walk_noise
 from sim.simulator import Start
 from sim.trajectory import KINEMATIC_TYPE
 
@@ -59,17 +60,6 @@ class GridEmulatorSettings(BaseModel):
         if self.unroll != sorted(self.unroll) or self.unroll[0] < 1:
             raise ValueError("unroll must be ascending numbers of calls")
         return self
-
-
-def random_walk_noise(position: Tensor, std: Tensor, moving: Tensor, generator: torch.Generator) -> Tensor:
-    """Position noise [history, N, d] whose velocities random-walk to ``std`` [d] at the last step; frame 0 and fixed particles get none.
-
-    Sanchez-Gonzalez et al. (2020): each of the h - 1 velocities adds N(0, std^2 / (h - 1)), summed along the window, summed again.
-    """
-    steps = position.shape[0] - 1
-    kick = torch.randn((steps, *position.shape[1:]), generator=generator, dtype=position.dtype) * (std / steps**0.5)
-    walk = kick.cumsum(0).cumsum(0) * moving[:, None]
-    return torch.cat([torch.zeros_like(position[:1]), walk])
 
 
 class _StencilConv(torch.autograd.Function):
@@ -366,7 +356,7 @@ class GridEmulator(nn.Module):
         if 0 < self.options.select < windows.examples:
             windows = self._select(windows, generator)
         moving = windows.particle_type != KINEMATIC_TYPE
-        noise = random_walk_noise(windows.position[:history], self.options.noise * self.velocity_std, moving, generator)
+        noise = random_walk_noise(windows.position[:history], self.options.noise * self.velocity_std, generator, moving)
         state = windows.position[:history] + noise
         target = windows.position[history:] + noise[-1]
         scale = self._scale(windows.position, moving)

@@ -110,6 +110,13 @@ def test_types_and_context_are_built_only_where_the_data_have_them():
     assert torch.equal(nodes[0, 8:24], nodes[2, 8:24]) and not torch.equal(nodes[0, 8:24], nodes[1, 8:24])
 
 
+def test_random_walk_noise_per_axis_leaves_the_fixed_alone():
+    moving = torch.arange(20000) >= 100
+    noise = random_walk_noise(torch.zeros(6, 20000, 2), torch.tensor([1e-3, 2e-3]), torch.Generator().manual_seed(0), moving)
+    assert noise[0].abs().max() == 0 and noise[:, :100].abs().max() == 0
+    assert torch.allclose((noise[-1] - noise[-2])[100:].std(0), torch.tensor([1e-3, 2e-3]), rtol=0.03)
+
+
 def test_random_walk_noise_statistics():
     position, sigma = torch.zeros(6, 20000, 2), 0.3
     noise = random_walk_noise(position, sigma, torch.Generator().manual_seed(0))

@@ -9,7 +9,7 @@ from pydantic import ValidationError
 from torch import nn
 
 from learn.dataset import DataSpec, Windows
-from learn.grid_emulator import GridEmulator, GridEmulatorSettings, SparseGrid, StencilConv, random_walk_noise
+from learn.grid_emulator import GridEmulator, GridEmulatorSettings, SparseGrid, StencilConv
 from sim.simulator import Start, rollout
 
 GRAVITY, FRAME_STEP = (0.0, -9.8), 0.0025
@@ -175,14 +175,6 @@ def test_full_blend_gives_the_grid_velocity() -> None:
 def test_windows_grow_with_progress() -> None:
     model = emulator({"history": 3, "unroll": [1, 2, 4]})
     assert [model.window(progress) for progress in (0.0, 0.34, 0.67, 1.0)] == [7, 11, 19, 19]
-
-
-def test_noise_random_walk() -> None:
-    position = torch.zeros(6, 20000, 2)
-    moving = torch.arange(20000) >= 100
-    noise = random_walk_noise(position, torch.tensor([1e-3, 2e-3]), moving, torch.Generator().manual_seed(0))
-    assert noise[0].abs().max() == 0 and noise[:, :100].abs().max() == 0
-    assert torch.allclose((noise[-1] - noise[-2])[:, :][100:].std(0), torch.tensor([1e-3, 2e-3]), rtol=0.03)
 
 
 def test_targets_move_with_the_noise() -> None:
