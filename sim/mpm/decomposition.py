@@ -1,4 +1,4 @@
-"""Spectral decomposition of small symmetric matrices and accurate log1p/expm1, for constitutive models.
+"""Spectral decomposition of small symmetric matrices, accurate log1p/expm1 and a test for NaN, for constitutive models.
 
 A symmetric matrix is a vector: (xx, yy, xy) in 2D, (xx, yy, zz, yz, xz, xy) in 3D (Voigt's order).
 """
@@ -28,6 +28,12 @@ def expm1(y):
     else:
         result = ti.exp(y) - 1.0
     return result
+
+
+@ti.func
+def finite(y):
+    """Neither infinite nor NaN, read from the bits of a float32: fast-math compiles comparisons with NaN away, and maxima drop it."""
+    return (ti.bit_cast(y, ti.i32) & 0x7F800000) != 0x7F800000
 
 
 @ti.func

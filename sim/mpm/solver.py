@@ -13,6 +13,7 @@ import time
 import numpy as np
 
 from sim.errors import InputError
+from sim.mpm.decomposition import finite
 from sim.mpm.materials import MODELS
 from sim.mpm.walls import wall
 from sim.scene import Particles, Scene
@@ -29,8 +30,9 @@ MAX_HALVINGS = 6
 
 #: Distance from a wall, in cells, at which particles are stopped.
 HAIR = 1e-4
-#: What a frame adds up: kinetic, potential, elastic energy; the largest of squared speed, wave speed, squared speed within the frame.
-SUMS = 6
+#: What a frame adds up: kinetic, potential, elastic energy; the largest of squared speed, wave speed, squared speed within the frame;
+#: particles that are not finite.
+SUMS = 7
 
 
 def _power_of_two(n: int) -> int:
@@ -197,7 +199,7 @@ class _Kernels:
 
     @ti.func
     def report(self, m: ti.template(), p, position: ti.template(), sums: ti.template()):
-        """Position of one particle [length], and its part in the sums (see ``SUMS``). Sums, unlike maxima, carry a NaN to the host."""
+        """Position of one particle [length], and its part in the sums (see ``SUMS``)."""
         mass, volume = self.mass_volume[m][0], self.mass_volume[m][1]
         speed2, height = 0.0, 0.0
         for d in ti.static(range(self.dim)):
@@ -210,6 +212,10 @@ class _Kernels:
         sums[2] += ti.cast(volume * self.materials[m].energy_density(p), ti.f64)
         ti.atomic_max(sums[3], ti.cast(speed2, ti.f64))
         ti.atomic_max(sums[4], ti.cast(self.materials[m].wave_speed(p), ti.f64))
+        broken = not (finite(self.x[p].sum() + speed2) and self.materials[m].intact(p))
+        for a in ti.static(range(self.dim)):
+            broken = broken or not finite(self.C[a][p].sum())
+        sums[6] += ti.cast(broken, ti.f64)
 
     @ti.kernel
     def frame_serial(
@@ -492,8 +498,7 @@ class MPMSimulator:
         for attempt in range(MAX_HALVINGS + 1):
             dt = scene.frame_step / substeps
             sums = self._run(substeps, dt, keep=attempt == 0)
-            # NaN reaches the host in the sums, where fast-math cannot optimise the test away.
-            if np.isfinite(sums).all():
+            if np.isfinite(sums).all() and sums[6] == 0:
                 speed = float(np.sqrt(max(sums[3], sums[5])))
                 if dt * (speed + sums[4]) <= COURANT_GROWTH * self._cfl * self.dx and dt * speed <= self.dx:
                     return self._position[self._tracked]

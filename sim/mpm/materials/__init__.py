@@ -1,8 +1,9 @@
 """Constitutive models, one small file each.
 
-A material owns the state its particles need and nothing else. It offers three Taichi functions on particle p:
+A material owns the state its particles need and nothing else. It offers Taichi functions on particle p:
 ``kirchhoff(p, gradient_dt)`` advances the state by the velocity gradient times dt and returns the Kirchhoff stress tau
-[dim, dim]; ``energy_density(p)`` is the elastic energy per reference volume; ``wave_speed(p)`` bounds the local sound speed.
+[dim, dim]; ``energy_density(p)`` is the elastic energy per reference volume; ``wave_speed(p)`` bounds the local sound speed;
+``intact(p)`` says that the state is finite and its volume positive.
 Numbers live in a field, not in the code, so that scenes which differ in numbers share compiled kernels.
 """
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sim.mpm.decomposition import assemble2, assemble3, decompose2, decompose3, expm1, log1p, pack2, pack3, unpack2, unpack3
+from sim.mpm.decomposition import assemble2, assemble3, decompose2, decompose3, expm1, finite, log1p, pack2, pack3, unpack2, unpack3
 from sim.taichi_runtime import ti
 
 
@@ -139,3 +139,12 @@ class SandModel:
     def wave_speed(self, p):
         """sqrt((lambda + 2 mu) / rho)."""
         return ti.sqrt((self.parameters[0] + 2.0 * self.parameters[1]) / self.parameters[3])
+
+    @ti.func
+    def intact(self, p):
+        det = 0.0
+        if ti.static(self.dim == 2):
+            det = (unpack2(self.b[p]) + ti.Matrix.identity(ti.f32, 2)).determinant()
+        else:
+            det = (unpack3(self.b[p]) + ti.Matrix.identity(ti.f32, 3)).determinant()
+        return finite(det + self.v[p]) and det > 0.0

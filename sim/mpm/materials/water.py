@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from sim.mpm.decomposition import expm1, finite
 from sim.taichi_runtime import ti
 
 
@@ -68,15 +69,26 @@ class WaterModel:
 
     @ti.func
     def energy_density(self, p):
-        """psi = B [(J^(1-gamma) - 1) / (gamma - 1) + J - 1], whose derivative is -p; expanded about J = 1, where float32 cancels."""
+        """psi = B [(J^(1-gamma) - 1) / (gamma - 1) + J - 1], whose derivative is -p; expanded about J = 1, where float32 cancels.
+
+        With a = (1 - gamma) log J the quotient is -log J expm1(a) / a, which has a limit at gamma = 1.
+        """
         J, gamma = self.J[p], self.parameters[1]
         e = 1.0 - J
         psi = 0.5 * gamma * e * e * (1.0 + (gamma + 1.0) / 3.0 * e)
-        if ti.abs(e) > 1e-2 and gamma > 1.0 + 1e-6:
-            psi = (self.power(J) - 1.0) / (gamma - 1.0) - e
+        if ti.abs(e) > 1e-2:
+            a = (1.0 - gamma) * ti.log(J)
+            ratio = 1.0
+            if ti.abs(a) > 1e-6:
+                ratio = expm1(a) / a
+            psi = -ti.log(J) * ratio - e
         return self.parameters[0] * psi
 
     @ti.func
     def wave_speed(self, p):
         """c = c0 J^(-(gamma - 1) / 2), from c^2 = dp/drho."""
         return self.parameters[2] * ti.sqrt(self.power(self.J[p]))
+
+    @ti.func
+    def intact(self, p):
+        return finite(self.J[p]) and self.J[p] > 0.0
