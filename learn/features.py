@@ -32,7 +32,8 @@ def random_walk_noise(position: Tensor, sigma: float | Tensor, generator: torch.
     """Noise for a window of positions whose velocities have done a random walk; [frames, particles, dim], zero in the first frame.
 
     Each of the C = frames - 1 velocities adds N(0, sigma^2 / C) per axis, summed along the window, so that the last velocity's noise
-    has standard deviation ``sigma`` [length / frame] (a number, or [dim]); summed once more into positions. Particles outside ``moving`` [particles] get none.
+    has standard deviation ``sigma`` [length / frame] (a number, or [dim]); summed once more into positions. Particles outside
+    ``moving`` [particles] get none.
     Drawn on the CPU, so that a seed means the same noise on every device.
     """
     frames, particles, dim = position.shape
