@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shutil
 import signal
 import time
 from pathlib import Path
@@ -146,3 +147,38 @@ def test_resume_after_kill_9(tree):
     assert (run / "log.csv").read_text().splitlines()[:4] == rows  # it went on, times and all, instead of beginning again
     assert json.loads((results / "models" / "gns" / "seed-0.json").read_text())["steps"] == 300
     assert {path: path.stat().st_mtime_ns for path in shards} == shards
+
+
+# A shipped checkpoint -------------------------------------------------------------------------------------------------------
+
+SHIPPED = """
+title: "Shipped"
+data:
+  puddle: {scene: configs/scenes/puddle.yaml, seed: 1, test: 1}
+models:
+  shipped: {checkpoint: pretrained/puddle/best.pt}
+comparisons:
+  puddle:
+    data: puddle
+    trajectories: 1
+    ladder: [{name: "cfl 0.8", cfl: 0.8}]
+    learned: [shipped]
+    timing: {frames: 5}
+    films: []
+"""
+
+
+def test_a_checkpoint_is_compared_without_training(copied):
+    results, shipped = copied / "results" / "micro", copied / "pretrained" / "puddle"
+    shipped.mkdir(parents=True)
+    for name in ("best.pt", "done.json", "log.csv", "validation.csv"):
+        shutil.copy2(results / "training" / "gns" / "seed-0" / name, shipped)
+    shutil.copy2(results / "data" / "puddle" / "learning.json", shipped / "dataset.json")
+    (copied / "configs" / "studies" / "shipped.yaml").write_text(SHIPPED)
+    code, output = snakemake(copied, study="configs/studies/shipped.yaml")
+    assert code == 0, output
+    made = json.loads((copied / "results" / "shipped" / "summary.json").read_text())
+    (row,) = [row for row in made["rows"] if row["kind"] == "learned"]
+    assert row["contender"] == "shipped" and row["status"] == "ok" and row["cost"]["steps"] == 300
+    page = (copied / "results" / "shipped" / "report.html").read_text()
+    assert "data:video" not in page and page.count("data:image/svg+xml") == 4  # three figures and the curve of the shipped training
