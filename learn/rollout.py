@@ -16,18 +16,21 @@ from sim.simulator import rollout, start_from
 from sim.trajectory import Trajectory, write_json, write_shard
 
 
-def rollout_trajectory(model: nn.Module, trajectory: Trajectory, frames: int | None, simulator: dict) -> tuple[Trajectory, dict]:
+def rollout_trajectory(
+    model: nn.Module, trajectory: Trajectory, frames: int | None, simulator: dict, known: int | None = None
+) -> tuple[Trajectory, dict]:
     """The model's version of ``trajectory``, and its cost {"seconds", "begin_seconds", "frames"}.
 
     It begins with the ``model.history`` frames the model was given and goes on for ``frames`` frames (None: to the end of the true
     one). A rollout that fails keeps its finite frames and its status. simulator: what the file says made it.
     """
-    available = len(trajectory.position) - model.history
+    known = model.history if known is None else known
+    available = len(trajectory.position) - known
     wanted = available if frames is None else min(frames, available)
     with torch.no_grad():
-        result = rollout(model, start_from(trajectory, model.history), wanted)
+        result = rollout(model, start_from(trajectory, known), wanted)
     finite = int(np.isfinite(result.position).all(axis=(1, 2)).sum())
-    position = np.concatenate([trajectory.position[: model.history], result.position[:finite]])
+    position = np.concatenate([trajectory.position[:known], result.position[:finite]])
     predicted = Trajectory(
         position=position, particle_type=trajectory.particle_type, frame_step=trajectory.frame_step, radius=trajectory.radius,
         bounds=trajectory.bounds, scene=trajectory.scene, seed=trajectory.seed, simulator=simulator, status=result.status,

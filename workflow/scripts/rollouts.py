@@ -14,16 +14,18 @@ from workflow.contenders import learned, test_trajectories
 from workflow.study import load_study
 
 
-def main(path: str, comparison: str, rows: str, truth: str, *shards: str) -> None:
+def main(path: str, comparison: str, errors: str, truth: str, *shards: str) -> None:
     study = load_study(path)
     films = study.comparisons[comparison]["films"]
-    number = median_trajectory(json.loads(Path(rows).read_text()), films[0])
+    rows = json.loads(Path(errors).read_text())
+    number = median_trajectory(rows, films[0])
     trajectory = test_trajectories(study, comparison)[number]
     write_shard(truth, {number: trajectory})
     for model, shard in zip(films, shards, strict=True):
         contender = learned(study, comparison, model)[0]
         simulator = {"name": model, "kind": contender.kind, "settings": contender.settings}
-        write_shard(shard, {number: rollout_trajectory(contender, trajectory, None, simulator)[0]})
+        # From the frames that the comparison gives to all, so that the film shows what the rows measured.
+        write_shard(shard, {number: rollout_trajectory(contender, trajectory, None, simulator, rows[0]["known_frames"])[0]})
 
 
 if __name__ == "__main__":
