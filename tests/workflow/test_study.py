@@ -13,11 +13,7 @@ from workflow.study import load_study
 @pytest.fixture(scope="module")
 def place(tmp_path_factory) -> Path:
     """A tree for tests that run nothing."""
-    folder = make_tree(tmp_path_factory.mktemp("study") / "tree")
-    shipped = folder / "pretrained" / "waterdrop_gns" / "best.pt"
-    shipped.parent.mkdir(parents=True)
-    shipped.touch()
-    return folder
+    return make_tree(tmp_path_factory.mktemp("study") / "tree")
 
 
 def write(folder: Path, change, name: str = "changed") -> str:
