@@ -83,7 +83,11 @@ def start_slow(folder, jobs=2):
     scene.write_text(json.dumps(FAMILY))
     arguments = ["generate", str(scene), "--split", "train", "--count", "6", "--shard-size", "2", "--jobs", str(jobs), "--out", str(folder)]
     environment = os.environ | {"PYTHONPATH": f"{HERE}:{HERE.parent.parent}"}
-    return subprocess.Popen([sys.executable, "-c", code, *arguments], env=environment, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    # A shell ignores SIGINT in what it runs in the background, and children inherit that.
+    return subprocess.Popen(
+        [sys.executable, "-c", code, *arguments], env=environment, stderr=subprocess.PIPE, text=True, start_new_session=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )
 
 
 def wait_for(condition, seconds=60):

@@ -617,7 +617,8 @@ def test_water_compiles_no_decomposition(monkeypatch):
     for name in ("decompose2", "decompose3", "assemble2", "assemble3"):
         monkeypatch.setattr(sand_module, name, refuse)
     assert np.isfinite(run(MPMSimulator(), SMALL, 1)).all()
-    with pytest.raises(AssertionError, match="a decomposition in water"):
+    # Taichi may wrap what is raised while it compiles.
+    with pytest.raises((AssertionError, ti.TaichiCompilationError), match="a decomposition in water"):
         MPMSimulator().load(SANDPILE)
 
 
