@@ -515,6 +515,20 @@ def test_not_a_number_is_caught_within_its_frame(request, field, material, value
     assert len(trajectory.position) == 4 and np.isfinite(trajectory.position).all(), "the frames before it are kept"
 
 
+def test_a_step_that_would_turn_a_volume_inside_out_is_repeated(water):
+    """A lone droplet, torn to J = 16, whose gradient would take it to 16 (1 - 1.2) < 0 in one step. At |J| > 1 sound is slow, so the
+    Courant number has no objection; such a droplet once ran to J = -33 and the trajectory failed."""
+    what = scene([("water", [0.5, 0.5], [0.52, 0.52])], gravity=[0.0, 0.0], frame_step=0.001)
+    water.load(what)
+    J = water._kernels.materials[0].J
+    J.from_numpy(np.full(J.shape, 16.0, np.float32))
+    put(water, np.zeros((1, 2)), np.eye(2)[None] * -0.6 / what.frame_step)
+    planned = what.frame_step * water.diagnostics()["wave_speed"] / (water._cfl * water.dx)
+    assert planned < 1, "one step is planned"
+    assert np.isfinite(water.frame()).all()
+    assert water.diagnostics()["substeps"] > 1 and J.to_numpy()[0] > 0
+
+
 def test_a_step_that_would_need_too_many_halvings_is_given_up(water, monkeypatch):
     run(water, DROP, 3)
     tried = []
@@ -617,8 +631,7 @@ def test_water_compiles_no_decomposition(monkeypatch):
     for name in ("decompose2", "decompose3", "assemble2", "assemble3"):
         monkeypatch.setattr(sand_module, name, refuse)
     assert np.isfinite(run(MPMSimulator(), SMALL, 1)).all()
-    # Taichi may wrap what is raised while it compiles.
-    with pytest.raises((AssertionError, ti.TaichiCompilationError), match="a decomposition in water"):
+    with pytest.raises(Exception, match="a decomposition in water"):
         MPMSimulator().load(SANDPILE)
 
 
