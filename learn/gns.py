@@ -54,6 +54,9 @@ class Settings(BaseModel):
     noise_unit: Literal["velocity_std", "absolute"] = "velocity_std"  # of ``noise``: rms velocity std over the axes, or length / model frame
     ballistic: bool = False  # predictions start from gravity * dt^2 instead of the mean acceleration
     unroll: tuple[PositiveInt, ...] = Field((1,), min_length=1)  # calls the loss is unrolled over, in equal shares of the training: (1, 2, 4)
+    # Impacts hold most of the acceleration's variance in a per cent of the particles: beyond this many standard deviations an error counts
+    # linearly (Charbonnier's loss 2 h^2 (sqrt(1 + e^2 / h^2) - 1)); None: squared, as in the paper.
+    huber: float | None = Field(None, gt=0)
     # Of products and edge latents; particle latents, sums and weight gradients stay f32. A CPU without bf16 units (AMX, AVX-512 BF16)
     # emulates bf16, many times slower than f32.
     precision: Literal["f32", "bf16"] = "f32"
@@ -281,6 +284,8 @@ class GNS(nn.Module):
             following = windows.position[given + call - 1] + noise[-1]
             error = (output - self.features.target(position, following)) / (call * (call + 1) / 2)
             square = error.square().sum(1)
+            if self.options.huber is not None:
+                square = 2 * self.options.huber**2 * ((1 + square / self.options.huber**2).sqrt() - 1)
             total = total + (square if moving is None else square[moving]).mean()
             if call < calls:
                 predicted = 2 * position[-1] - position[-2] + self.features.acceleration(output)

@@ -130,6 +130,35 @@ class _Kernels:
             self.grid[I] = cell
 
     @ti.func
+    def fold(self, axis: ti.template(), side, I, dt):
+        """What particles gave to a ghost node goes to the two nodes that its velocity is made of, lest the wall's reaction be short.
+
+        With v(-1) = 2 v(0) - v(1) the virtual power of the ghost's momentum p and mass m acts on v(0) and v(1):
+        (m0 + 4 m) v0 - 2 m v1 = p0 + 2 p and (m1 + m) v1 - 2 m v0 = p1 - p. Linear velocity fields and momentum are kept. The wall
+        then changes v0, and v1 follows by 2 m / (m1 + m) of that; where v0 is held at zero this is the mirror
+        image of a method of images. Dropped instead, a column's pressure read 10 % high in the lowest cell. Velocities are written back as momenta of
+        the nodes' own masses, for ``update_node``. m0 and m1 exceed zero wherever m does: a particle reaches all three nodes.
+        """
+        at = self.extent[side][axis]
+        inward = 1 - 2 * side
+        ghost = ti.Vector([(at - inward if d == axis else I[d]) for d in ti.static(range(self.dim))])
+        inner = ti.Vector([(at + inward if d == axis else I[d]) for d in ti.static(range(self.dim))])
+        held = ti.Vector([(at if d == axis else I[d]) for d in ti.static(range(self.dim))])
+        m, m0, m1 = self.grid[ghost][self.dim], self.grid[held][self.dim], self.grid[inner][self.dim]
+        if m > 0.0:
+            det = (m0 + 4.0 * m) * (m1 + m) - 4.0 * m * m
+            free, fixed = ti.Vector.zero(ti.f32, self.dim), ti.Vector.zero(ti.f32, self.dim)
+            for d in ti.static(range(self.dim)):
+                r0, r1 = self.grid[held][d] + 2.0 * self.grid[ghost][d], self.grid[inner][d] - self.grid[ghost][d]
+                free[d] = ((m1 + m) * r0 + 2.0 * m * r1) / det
+                fixed[d] = ((m0 + 4.0 * m) * r1 + 2.0 * m * r0) / det
+            fall = free + dt * self.gravity[None]
+            u = wall(fall, held, self.extent[0], self.extent[1], self.friction, self.coefficient[None])
+            for d in ti.static(range(self.dim)):
+                self.grid[held][d] = m0 * free[d]
+                self.grid[inner][d] = m1 * (fixed[d] + 2.0 * m / (m1 + m) * (u[d] - fall[d]))
+
+    @ti.func
     def extrapolate(self, axis: ti.template(), side, I):
         """Ghost node behind a wall: v(-1) = 2 v(0) - v(1). ``I`` names the line; its entry along ``axis`` is not used.
 
@@ -146,6 +175,29 @@ class _Kernels:
         if self.grid[inner][self.dim] > 0.0:
             value = 2.0 * self.grid[held] - self.grid[inner]
         self.grid[ghost] = value
+
+    @ti.func
+    def ghost(self, axis: ti.template(), side, I, dt, before: ti.template()):
+        """``fold`` before the nodes' update, ``extrapolate`` after it."""
+        if ti.static(before):
+            self.fold(axis, side, I, dt)
+        else:
+            self.extrapolate(axis, side, I)
+
+    @ti.func
+    def at_walls(self, low, high, dt, before: ti.template()):
+        """``ghost`` on every line of nodes that ends behind a wall the particles touch."""
+        for axis in ti.static(range(self.dim)):
+            for side in range(2):
+                if (side == 0 and low[axis] < WALL) or (side == 1 and high[axis] + 2 > self.extent[1][axis]):
+                    if ti.static(self.dim == 2):
+                        for i in range(low[1 - axis], high[1 - axis] + 3):
+                            self.ghost(axis, side, ti.Vector([i, i]), dt, before)
+                    else:
+                        for i in range(low[(axis + 1) % 3], high[(axis + 1) % 3] + 3):
+                            for j in range(low[(axis + 2) % 3], high[(axis + 2) % 3] + 3):
+                                line = ti.Vector([(0 if d == axis else i if d == (axis + 1) % 3 else j) for d in ti.static(range(3))])
+                                self.ghost(axis, side, line, dt, before)
 
     @ti.func
     def g2p(self, p, dt):
@@ -233,6 +285,7 @@ class _Kernels:
                     base, fx = self.locate(self.x[p])
                     low, high = ti.min(low, base), ti.max(high, base)
                     self.p2g(m, p, base, fx, dt)
+            self.at_walls(low, high, dt, before=True)
             if ti.static(self.dim == 2):
                 for i in range(low[0], high[0] + 3):
                     for j in range(low[1], high[1] + 3):
@@ -242,17 +295,7 @@ class _Kernels:
                     for j in range(low[1], high[1] + 3):
                         for k in range(low[2], high[2] + 3):
                             self.update_node(ti.Vector([i, j, k]), dt)
-            for axis in ti.static(range(self.dim)):
-                for side in range(2):
-                    if (side == 0 and low[axis] < WALL) or (side == 1 and high[axis] + 2 > self.extent[1][axis]):
-                        if ti.static(self.dim == 2):
-                            for i in range(low[1 - axis], high[1 - axis] + 3):
-                                self.extrapolate(axis, side, ti.Vector([i, i]))
-                        else:
-                            for i in range(low[(axis + 1) % 3], high[(axis + 1) % 3] + 3):
-                                for j in range(low[(axis + 2) % 3], high[(axis + 2) % 3] + 3):
-                                    line = ti.Vector([(0 if d == axis else i if d == (axis + 1) % 3 else j) for d in ti.static(range(3))])
-                                    self.extrapolate(axis, side, line)
+            self.at_walls(low, high, dt, before=False)
             fastest = 0.0
             for p in range(self.range[ti.static(len(self.models))]):
                 fastest = ti.max(fastest, self.g2p(p, dt))
@@ -285,12 +328,16 @@ class _Kernels:
             for p in range(self.range[m], self.range[m + 1]):
                 base, fx = self.locate(self.x[p])
                 self.p2g(m, p, base, fx, dt)
+        for axis in ti.static(range(self.dim)):
+            for I in ti.grouped(self.grid):
+                if I[axis] < 2:
+                    self.ghost(axis, I[axis], I, dt, True)
         for I in ti.grouped(self.grid):
             self.update_node(I, dt)
         for axis in ti.static(range(self.dim)):
             for I in ti.grouped(self.grid):
                 if I[axis] < 2:
-                    self.extrapolate(axis, I[axis], I)
+                    self.ghost(axis, I[axis], I, dt, False)
         for p in range(self.range[ti.static(len(self.models))]):
             ti.atomic_max(sums[5], ti.cast(self.g2p(p, dt), ti.f64))
         for I in ti.grouped(self.grid):

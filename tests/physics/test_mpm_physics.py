@@ -155,7 +155,6 @@ def test_hydrostatics(column):
     assert kinetic <= 1e-3, kinetic
 
 
-@pytest.mark.xfail(strict=True, reason="4 %, the lowest cell reads 10 % high: what particles give to the ghost nodes behind a wall is dropped")
 def test_hydrostatics_down_to_the_floor(column):
     p, exact, _, _ = column
     assert l2(p, exact) <= 0.03
