@@ -17,6 +17,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -350,15 +351,18 @@ class Yardstick:
 
     metric: str = "rollout_mse_moving"
     at: str | None = "all"
+    over: Literal["median", "mean"] = "median"  # of the trajectories
 
     def of(self, row: dict) -> float | None:
-        value = row[self.metric]
+        value = (row["mean"] if self.over == "mean" else row)[self.metric]
         return value.get(self.at) if isinstance(value, dict) else value
 
     def __str__(self) -> str:
         name = self.metric.removesuffix("_moving").replace("_", " ").replace("mse", "MSE").replace("emd", "EMD")
         if self.metric.endswith("_moving"):
             name += " of moving particles"
+        if self.over == "mean":
+            name = f"mean {name}"
         if self.at is None:
             return name
         if "mse" in self.metric:

@@ -35,7 +35,8 @@ class DataSettings(BaseModel):
 
     stride: int = Field(1, ge=1)  # file frames from one frame of a window to the next
     mirror: bool = False  # flip half of the windows about the box centre, along every axis that gravity does not mark
-    skip_rest: float = Field(0.0, ge=0, allow_inf_nan=False)  # leave out windows in which no particle moves faster than this share of |velocity std|
+    # Leave out windows at rest: after the first motion, no particle faster than this share of |velocity std|.
+    skip_rest: float = Field(0.0, ge=0, allow_inf_nan=False)
 
 
 def _tuple(value: object) -> object:
@@ -361,7 +362,8 @@ class Dataset:
         """[windows, 2] int32: trajectory and first file frame of every window of ``frames`` frames.
 
         ``skip_rest`` > 0 leaves out the windows in which the largest speed of a moving particle, from one file frame to the next, never
-        reaches ``skip_rest`` |velocity std at stride 1|: half of a granular run is rest, which teaches copying. Raises ``InputError``
+        reaches ``skip_rest`` |velocity std at stride 1|: half of a granular run is rest, which teaches copying. What comes before the
+        first motion stays: a model that has not seen bodies start to fall from rest leaves them hanging. Raises ``InputError``
         where no window is left.
         """
         span = (frames - 1) * stride
@@ -371,6 +373,8 @@ class Dataset:
             first = np.arange(max(length - span, 0), dtype=np.int32)
             if skip_rest > 0 and span > 0 and len(first):
                 moving = self._speed(number) >= floor
+                if moving.any():
+                    moving[: moving.argmax()] = True
                 # A window is kept if any of its ``span`` file steps moves: difference of the running count.
                 count = np.concatenate([[0], np.cumsum(moving)])
                 first = first[count[first + span] > count[first]]

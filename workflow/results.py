@@ -43,7 +43,7 @@ def _targets(study: Study, comparison: str, scene: str) -> list[Target]:
     targets = []
     for entry in study.comparisons[comparison]["targets"]:
         limits = {key: entry[key] for key in ("high", "low", "relative_to") if key in entry}
-        yardstick = Yardstick(entry["metric"], str(entry["at"]) if "at" in entry else None)
+        yardstick = Yardstick(entry["metric"], str(entry["at"]) if "at" in entry else None, entry.get("over", "median"))
         targets.append(Target(scene, entry["contender"], yardstick, **limits))
     return targets
 

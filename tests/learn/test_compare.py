@@ -331,6 +331,8 @@ def test_references_and_scenes_are_kept_apart():
 def test_other_yardsticks():
     end = c.Yardstick("emd", "1")
     assert end.of(TEACHER) == 2.0 and str(end) == "EMD at the end" and str(c.Yardstick("emd", "0.5")) == "EMD at 50% of the run"
+    mean = c.Yardstick("emd", "1", over="mean")
+    assert mean.of(TEACHER | {"mean": {"emd": {"1": 3.0}}}) == 3.0 and str(mean) == "mean EMD at the end"
     assert str(c.Yardstick("one_step_mse", None)) == "one step MSE" and str(c.Yardstick("rollout_mse", "20")) == "rollout MSE over 20 frames"
 
 

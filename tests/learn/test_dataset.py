@@ -186,6 +186,8 @@ def test_skip_rest_leaves_out_the_windows_at_rest(tmp_path: Path, write_dataset)
     assert kept[:, 1].tolist() == list(range(9))
     with pytest.raises(InputError, match="skip_rest"):
         dataset.windows(4, skip_rest=1e3)
+    late = Dataset(write_dataset(tmp_path / "late", {"train": {0: trajectory(np.concatenate([np.repeat(path[:1], 5, axis=0), path]))}}), "train")
+    assert late.windows(4, skip_rest=0.2)[:, 1].tolist() == list(range(14)), "the rest before the first motion stays"
 
 
 def test_small_memory_reads_from_disk_and_agrees(bounce_dataset: Path) -> None:
