@@ -135,9 +135,9 @@ class _Kernels:
 
         With v(-1) = 2 v(0) - v(1) the virtual power of the ghost's momentum p and mass m acts on v(0) and v(1):
         (m0 + 4 m) v0 - 2 m v1 = p0 + 2 p and (m1 + m) v1 - 2 m v0 = p1 - p. Linear velocity fields and momentum are kept. The wall
-        then changes v0, and v1 follows by 2 m / (m1 + m) of that; where v0 is held at zero this is the mirror
-        image of a method of images. Dropped instead, a column's pressure read 10 % high in the lowest cell. Velocities are written back as momenta of
-        the nodes' own masses, for ``update_node``. m0 and m1 exceed zero wherever m does: a particle reaches all three nodes.
+        then changes v0, and v1 follows by 2 m / (m1 + m) of that; where v0 is held at zero this is the method of images. Dropped
+        instead, a column's pressure read 10 % high in the lowest cell. Velocities are written back as momenta of the nodes' own
+        masses, for ``update_node``. m0 and m1 exceed zero wherever m does: a particle reaches all three nodes.
         """
         at = self.extent[side][axis]
         inward = 1 - 2 * side

@@ -6,7 +6,7 @@ Scenes of water share one solver and scenes of sand another, so that each struct
 import numpy as np
 import pytest
 
-from sim.mpm.solver import WALL, MPMSimulator
+from sim.mpm.solver import WALL
 from sim.scene import Scene
 
 pytestmark = pytest.mark.physics
@@ -32,17 +32,6 @@ WATER = {"model": "water", "sound_speed": 20.0}
 SAND = {"model": "sand", "young_modulus": 3.5e5, "friction_angle": 35.0}
 #: The box of all sand: one set of kernels for it.
 WIDE = {"bounds": [[0.0, 2.0], [0.0, 1.0]], "cells": [64, 32]}
-
-
-@pytest.fixture(scope="module")
-def water():
-    return MPMSimulator()
-
-
-@pytest.fixture(scope="module")
-def sand():
-    """All sand has rough walls: the kernels are shared."""
-    return MPMSimulator()
 
 
 def state(solver):

@@ -48,17 +48,6 @@ SANDPILE = scene([("sand", [0.25, 0.0], [0.5, 0.5], [1.0, 0.0])], {"sand": SAND}
 
 
 @pytest.fixture(scope="module")
-def water():
-    """One solver for all scenes of water in 2D: they share its kernels."""
-    return MPMSimulator()
-
-
-@pytest.fixture(scope="module")
-def sand():
-    return MPMSimulator()
-
-
-@pytest.fixture(scope="module")
 def cube():
     """Water and sand in 3D."""
     return MPMSimulator()
