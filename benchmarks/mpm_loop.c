@@ -53,7 +53,51 @@ static inline void scatter(Grid grid, const float *x, const float *v, const floa
     }
 }
 
-/* Node velocities: gravity, then walls that stop what moves into them and take Coulomb friction from the tangential part. */
+/* Walls stop what moves into them and take Coulomb friction from the tangential part. */
+static inline void contact(float v[2], int i, int j, const Setting *s) {
+    int at[2] = {i, j}, high[2] = {WALL + s->rows, WALL + s->columns};
+    for (int a = 0; a < 2; a++) {
+        float normal = v[a];
+        if ((at[a] == WALL && normal < 0.0f) || (at[a] == high[a] && normal > 0.0f)) {
+            v[a] = 0.0f;
+            float tangent = v[1 - a], lost = s->friction * fabsf(normal);
+            v[1 - a] = fabsf(tangent) <= lost ? 0.0f : tangent - copysignf(lost, tangent);
+        }
+    }
+}
+
+/* What particles gave to a ghost node goes to the wall node (i, j) and the next one inwards, which make up its velocity. */
+static inline void fold(Node *ghost, int stride, int i, int j, const Setting *s, float dt) {
+    Node *held = ghost + stride, *inner = ghost + 2 * stride;
+    float m = ghost->m, m0 = held->m, m1 = inner->m, free[2], fixed[2], fall[2], stopped[2];
+    if (m <= 0.0f) return;
+    float det = (m0 + 4.0f * m) * (m1 + m) - 4.0f * m * m;
+    for (int a = 0; a < 2; a++) {
+        float r0 = held->p[a] + 2.0f * ghost->p[a], r1 = inner->p[a] - ghost->p[a];
+        free[a] = ((m1 + m) * r0 + 2.0f * m * r1) / det;
+        fixed[a] = ((m0 + 4.0f * m) * r1 + 2.0f * m * r0) / det;
+        stopped[a] = fall[a] = free[a] + dt * s->gravity[a];
+    }
+    contact(stopped, i, j, s);
+    for (int a = 0; a < 2; a++) {
+        held->p[a] = m0 * free[a];
+        inner->p[a] = m1 * (fixed[a] + 2.0f * m / (m1 + m) * (stopped[a] - fall[a]));
+    }
+}
+
+static void fold_ghosts(Grid grid, const Setting *s, float dt) {
+    int last = grid.rows - 1, end = grid.pitch - 1;
+    for (int j = 0; j <= end; j++) {
+        fold(grid.node + j, grid.pitch, WALL, j, s, dt);
+        fold(grid.node + last * grid.pitch + j, -grid.pitch, WALL + s->rows, j, s, dt);
+    }
+    for (int i = 0; i <= last; i++) {
+        fold(grid.node + i * grid.pitch, 1, i, WALL, s, dt);
+        fold(grid.node + i * grid.pitch + end, -1, i, WALL + s->columns, s, dt);
+    }
+}
+
+/* Node velocities: gravity, then walls. */
 static void update_nodes(Grid grid, const Setting *s, float dt) {
     for (int i = 0; i < grid.rows; i++)
         for (int j = 0; j < grid.pitch; j++) {
@@ -62,15 +106,7 @@ static void update_nodes(Grid grid, const Setting *s, float dt) {
             float inverse = 1.0f / c->m;
             c->p[0] = c->p[0] * inverse + dt * s->gravity[0];
             c->p[1] = c->p[1] * inverse + dt * s->gravity[1];
-            int at[2] = {i, j}, high[2] = {WALL + s->rows, WALL + s->columns};
-            for (int a = 0; a < 2; a++) {
-                float normal = c->p[a];
-                if ((at[a] == WALL && normal < 0.0f) || (at[a] == high[a] && normal > 0.0f)) {
-                    c->p[a] = 0.0f;
-                    float tangent = c->p[1 - a], lost = s->friction * fabsf(normal);
-                    c->p[1 - a] = fabsf(tangent) <= lost ? 0.0f : tangent - copysignf(lost, tangent);
-                }
-            }
+            contact(c->p, i, j, s);
         }
 }
 
@@ -138,6 +174,7 @@ void run_water(int n, float *x, float *v, float *C, float *J, int substeps, floa
             float A[4] = {k * c[0] + push, k * c[1], k * c[2], k * c[3] + push};
             scatter(grid, x + 2 * p, v + 2 * p, A, s->mass);
         }
+        fold_ghosts(grid, s, dt);
         update_nodes(grid, s, dt);
         fill_ghosts(grid);
         for (int p = 0; p < n; p++) gather(grid, s, dt, x + 2 * p, v + 2 * p, C + 4 * p);
@@ -195,6 +232,7 @@ void run_sand(int n, float *x, float *v, float *C, float *b, float *gain, int su
             float A[4] = {m * c[0] + q * tau[0], m * c[1] + q * tau[2], m * c[2] + q * tau[2], m * c[3] + q * tau[1]};
             scatter(grid, x + 2 * p, v + 2 * p, A, s->mass);
         }
+        fold_ghosts(grid, s, dt);
         update_nodes(grid, s, dt);
         fill_ghosts(grid);
         for (int p = 0; p < n; p++) gather(grid, s, dt, x + 2 * p, v + 2 * p, C + 4 * p);
