@@ -7,6 +7,7 @@ weights, and where they come from. A *training state* holds all that resuming ne
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import warnings
 from pathlib import Path
@@ -43,8 +44,11 @@ def validate(kind: type[Checked], content: object, where: object, key: str) -> C
 
 
 def _write(path: str | Path, content: dict) -> None:
+    # By way of memory: on a full disk torch's own writer raises no OSError.
+    buffer = io.BytesIO()
+    torch.save(content, buffer)
     with atomic_path(path) as temporary:
-        torch.save(content, temporary)
+        temporary.write_bytes(buffer.getbuffer())
 
 
 def _read(path: str | Path, form: str, keys: dict[str, type], device: torch.device | str, remedy: str) -> dict:

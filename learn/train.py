@@ -297,8 +297,16 @@ class Trainer:
     def run(self) -> dict:
         """Train to the end of the budget and return the content of ``done.json``.
 
-        Raises ``RunError`` on a loss that is not finite and after SIGTERM or SIGINT (a checkpoint is written first).
+        Raises ``RunError`` on a loss that is not finite, where the run folder cannot be written (a full disk), and after SIGTERM or
+        SIGINT (a checkpoint is written first).
         """
+        try:
+            return self._run()
+        except OSError as error:
+            reason = error.strerror or error
+            raise RunError(f"{self.folder}: cannot be written ({reason}); mend that and give the same command again to resume") from None
+
+    def _run(self) -> dict:
         done = self.folder / "done.json"
         if done.is_file() and self.step > 0 and self._finished_before(done):
             return json.loads(done.read_text())

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import csv
+import errno
 import json
 import math
 import os
@@ -223,6 +224,17 @@ def test_a_loss_that_is_not_finite_stops_the_run(bounce_dataset: Path, tmp_path:
     state = load_state(tmp_path / "run" / "checkpoint.pt")
     assert state["progress"]["step"] == 136 and all(torch.isfinite(value).all() for value in state["model"].values())
     assert load_model(tmp_path / "run" / "best.pt")
+
+
+def test_a_full_disk_stops_the_run_in_one_line(unbroken: Path, bounce_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as disk, pytest.raises(RunError, match=r"run: cannot be written \(No space left on device\)"):
+        disk.setattr(os, "fsync", full)
+        train(config(), bounce_dataset, tmp_path / "run")
+    train(config(), bounce_dataset, tmp_path / "run")
+    assert_same_run(unbroken, tmp_path / "run")
 
 
 def test_a_budget_in_minutes(bounce_dataset: Path, tmp_path: Path) -> None:
