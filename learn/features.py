@@ -50,14 +50,15 @@ class Features(nn.Module):
     sqrt(std^2 + sigma^2); velocities: C, how many past velocities are seen; radius: of the connectivity [length]; wall_distance: where
     the distances to the walls are clamped [length]; scaling: "velocity", C velocities by velocity std (the paper); "acceleration", the
     last velocity by velocity std and the C - 1 past accelerations by acceleration std; "last", the last velocity alone;
-    relative_velocity: v_sender - v_receiver on the edges; ballistic: predictions start from gravity * dt^2, not from the mean acceleration.
+    relative_velocity: v_sender - v_receiver on the edges; ballistic: predictions start from gravity * dt^2, not from the mean acceleration;
+    walls: that flight stops at the walls (slips along them), as the grid emulator's does, so that the stop need not be learnt.
     """
 
     def __init__(self, spec: DataSpec, *, sigma: float, velocities: int, radius: float, wall_distance: float, scaling: InputScaling,
-                 relative_velocity: bool, ballistic: bool):
+                 relative_velocity: bool, ballistic: bool, walls: bool = False):
         super().__init__()
         self.velocities, self.radius, self.wall_distance = velocities, radius, wall_distance
-        self.scaling, self.relative_velocity = scaling, relative_velocity
+        self.scaling, self.relative_velocity, self.walls = scaling, relative_velocity, walls
         step = spec.frame_step * spec.stride
         base = [g * step * step for g in spec.gravity] if ballistic else spec.acceleration_mean
 
@@ -124,10 +125,17 @@ class Features(nn.Module):
             columns.append(difference((position[-1] - position[-2]) / self.velocity_std))
         return torch.cat([column.to(self.velocity_std.dtype) for column in columns], 1)
 
-    def acceleration(self, output: Tensor) -> Tensor:
-        """Acceleration [length / frame^2] of a network's output [particles, dim]."""
-        return output * self.acceleration_std + self.acceleration_base
+    def base(self, position: Tensor, bounds: Tensor) -> Tensor:
+        """Acceleration [length / frame^2] that an output of zero means: a constant [dim], or [particles, dim] where flight stops at walls."""
+        if not self.walls:
+            return self.acceleration_base
+        inertia = 2 * position[-1] - position[-2]
+        return torch.minimum(torch.maximum(inertia + self.acceleration_base, bounds[:, 0]), bounds[:, 1]) - inertia
+
+    def acceleration(self, output: Tensor, position: Tensor, bounds: Tensor) -> Tensor:
+        """Acceleration [length / frame^2] of a network's output [particles, dim] at position [C + 1, particles, dim]; bounds [dim, 2]."""
+        return output * self.acceleration_std + self.base(position, bounds)
 
     def target(self, position: Tensor, following: Tensor) -> Tensor:
         """The output that takes position[-2:] to ``following``: ((p_next - 2 p_t + p_{t-1}) - base) / std; all [particles, dim] a frame."""
-        return (following - 2 * position[-1] + position[-2] - self.acceleration_base) / self.acceleration_std
+        return (following - 2 * position[-1] + position[-2] - self.base(position, self.bounds)) / self.acceleration_std

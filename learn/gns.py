@@ -53,6 +53,7 @@ class Settings(BaseModel):
     noise: float = Field(0.3, ge=0)  # sigma of the last velocity's noise (the paper's 6.7e-4 is .25-.5 of its velocity std)
     noise_unit: Literal["velocity_std", "absolute"] = "velocity_std"  # of ``noise``: rms velocity std over the axes, or length / model frame
     ballistic: bool = False  # predictions start from gravity * dt^2 instead of the mean acceleration
+    walls: bool = False  # ... and that flight stops at the walls; nothing stops a wrong prediction, so escapes stay visible
     unroll: tuple[PositiveInt, ...] = Field((1,), min_length=1)  # calls the loss is unrolled over, in equal shares of the training: (1, 2, 4)
     # Impacts hold most of the acceleration's variance in a per cent of the particles: beyond this many standard deviations an error counts
     # linearly (Charbonnier's loss 2 h^2 (sqrt(1 + e^2 / h^2) - 1)); None: squared, as in the paper.
@@ -251,7 +252,7 @@ class GNS(nn.Module):
         self.features = Features(
             spec, sigma=self.sigma, velocities=self.velocities, radius=self.radius, scaling=settings.inputs,
             wall_distance=self.radius if settings.wall_distance is None else settings.wall_distance * spec.spacing,
-            relative_velocity=settings.relative_velocity, ballistic=settings.ballistic,
+            relative_velocity=settings.relative_velocity, ballistic=settings.ballistic, walls=settings.walls,
         )
         self.network = Network(settings, self.features.node_width, self.features.edge_width, spec.dim)
 
@@ -288,7 +289,7 @@ class GNS(nn.Module):
                 square = 2 * self.options.huber**2 * ((1 + square / self.options.huber**2).sqrt() - 1)
             total = total + (square if moving is None else square[moving]).mean()
             if call < calls:
-                predicted = 2 * position[-1] - position[-2] + self.features.acceleration(output)
+                predicted = 2 * position[-1] - position[-2] + self.features.acceleration(output, position, self.features.bounds)
                 if moving is not None:
                     predicted = torch.where(moving[:, None], predicted, following)
                 position = torch.cat([position[1:], predicted[None]])
@@ -335,7 +336,7 @@ class GNS(nn.Module):
             raise SimulationError(f"particles clump: {graph.edges} edges, {self.options.edge_cap:g} x the {self._first_edges} of the start exceeded")
         output = self._predict(self._position, graph, self._type, self._bounds, context)
         last = self._position[-1]
-        acceleration = self.features.acceleration(output)
+        acceleration = self.features.acceleration(output, self._position, self._bounds)
         following = 2 * last - self._position[-2] + acceleration
         gravity = torch.as_tensor(start.gravity * (start.frame_step * stride) ** 2, dtype=last.dtype, device=last.device)
         fall = acceleration.to(last.dtype).clamp(gravity.clamp(max=0), gravity.clamp(min=0))

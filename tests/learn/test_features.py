@@ -91,12 +91,20 @@ def test_an_axis_without_motion_gives_zeros():
 
 
 def test_target_inverts_acceleration():
-    for ballistic in (False, True):
-        made = features(spec(), ballistic=ballistic)
+    for ballistic, walls in ((False, False), (True, False), (True, True)):
+        made = features(spec(), ballistic=ballistic, walls=walls)
         output = torch.tensor([[0.3, -1.0], [2.0, 0.0], [0.0, 0.0]])
-        following = 2 * POSITION[-1] - POSITION[-2] + made.acceleration(output)
+        following = 2 * POSITION[-1] - POSITION[-2] + made.acceleration(output, POSITION, made.bounds)
         near(made.target(POSITION, following), output.tolist())
-    near(made.acceleration(torch.zeros(1, 2)), [[0.0, -0.4]])  # gravity * (2 frames of 0.1 s)^2
+    made = features(spec(), ballistic=True)
+    near(made.acceleration(torch.zeros(1, 2), POSITION, made.bounds), [[0.0, -0.4]])  # gravity * (2 frames of 0.1 s)^2
+
+
+def test_flight_stops_at_the_walls():
+    """Flight ends at (.5, .6), (.5, .2), (.9, 1.5); the box is x <= .45, y >= .9; without forces the three come to (.5, 1), (.5, .6), (.9, 1.9)."""
+    made = features(spec(), ballistic=True, walls=True)
+    box = torch.tensor([[0.0, 0.45], [0.9, 1.95]])
+    near(made.acceleration(torch.zeros(3, 2), POSITION, box), [[-0.05, -0.1], [-0.05, 0.3], [-0.45, -0.4]])
 
 
 def test_types_and_context_are_built_only_where_the_data_have_them():
