@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent.parent
-PARTS = ("Snakefile", "profiles", "workflow", "configs", "sim", "learn")
+PARTS = ("Snakefile", "profiles", "workflow", "configs", "pretrained", "sim", "learn")
 
 MICRO_SCENE = """
 name: puddle
