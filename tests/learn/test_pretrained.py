@@ -1,4 +1,4 @@
-"""The shipped checkpoints: each loads, predicts, and was made by the recipe of its name."""
+"""The shipped checkpoints: each loads, predicts, and has its recipe's settings but for what ``done.json`` says was changed after training."""
 
 import json
 from pathlib import Path
@@ -19,7 +19,10 @@ def test_shipped_checkpoint(checkpoint: Path) -> None:
     model = load_model(checkpoint)
     done = json.loads((checkpoint.parent / "done.json").read_text())
     config = load_config(ROOT / "configs" / "models" / f"{checkpoint.parent.name}.yaml")
-    assert done["config"] == json.loads(json.dumps(config.model_dump(mode="json"))) and done["model"] == config.model
+    recipe, trained = json.loads(json.dumps(config.model_dump(mode="json"))), done["config"]
+    later = {name: new for name, (_, new) in done.get("changed", {}).get("after training", {}).items()}
+    assert {**trained, "settings": trained["settings"] | later} == recipe and done["model"] == config.model
+    assert all(model.settings[name] == value for name, value in recipe["settings"].items())
     assert done["parameters"] == sum(parameter.numel() for parameter in model.parameters())
     # A block high above the floor falls freely, near enough.
     spec = model.spec
