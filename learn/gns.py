@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
 import torch
-from pydantic import BaseModel, ConfigDict, Field, PositiveInt
+from pydantic import BaseModel, ConfigDict, Field, PositiveInt, model_validator
 from torch import Tensor, nn
 from torch.nn import functional as F
 
@@ -53,7 +53,7 @@ class Settings(BaseModel):
     noise: float = Field(0.3, ge=0)  # sigma of the last velocity's noise (the paper's 6.7e-4 is .25-.5 of its velocity std)
     noise_unit: Literal["velocity_std", "absolute"] = "velocity_std"  # of ``noise``: rms velocity std over the axes, or length / model frame
     ballistic: bool = False  # predictions start from gravity * dt^2 instead of the mean acceleration
-    walls: bool = False  # ... and that flight stops at the walls; nothing stops a wrong prediction, so escapes stay visible
+    walls: bool = False  # with ``ballistic``: that flight stops at the walls; nothing stops a wrong prediction, so escapes stay visible
     unroll: tuple[PositiveInt, ...] = Field((1,), min_length=1)  # calls the loss is unrolled over, in equal shares of the training: (1, 2, 4)
     # Impacts hold most of the acceleration's variance in a per cent of the particles: beyond this many standard deviations an error counts
     # linearly (Charbonnier's loss 2 h^2 (sqrt(1 + e^2 / h^2) - 1)); None: squared, as in the paper.
@@ -62,6 +62,12 @@ class Settings(BaseModel):
     # emulates bf16, many times slower than f32.
     precision: Literal["f32", "bf16"] = "f32"
     edge_cap: float = Field(4.0, gt=1)  # a rollout fails when its edges exceed this multiple of their first number (it clumps)
+
+    @model_validator(mode="after")
+    def _walls_stop_flight(self) -> Settings:
+        if self.walls and not self.ballistic:
+            raise ValueError("walls stops the ballistic flight; set ballistic: true with it")
+        return self
 
 
 class MLP(nn.Module):

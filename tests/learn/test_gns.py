@@ -257,6 +257,27 @@ def test_loss_is_zero_for_the_true_accelerations_and_counts_axes():
             assert abs(model.loss(w, torch.Generator(), 0.5).item() - 8.0) < 1e-2  # 2^2, summed over two axes
 
 
+def test_huber_loss_grows_linearly():
+    """2 h^2 (sqrt(1 + e^2 / h^2) - 1) with h = 1 and e^2 = 2^2 + 2^2: 2 (3 - 1) = 4 where the squared loss is 8."""
+    truth = path(7)
+    model = small(noise=0.0, huber=1.0)
+    w = Windows(torch.from_numpy(truth), torch.full((8,), 5), torch.zeros(8, dtype=torch.int64))
+    model.network = Truth(model, truth, error=2.0)
+    assert abs(model.loss(w, torch.Generator(), 0.5).item() - 4.0) < 1e-2
+
+
+def test_flight_that_stops_at_the_walls():
+    """A network that answers zero: particles thrown at the floor come to lie on it and slip along; without ``walls`` they fall through."""
+    truth = (np.array([0.2, 0.3]) + np.arange(6)[:, None, None] * np.array([5e-3, -1e-2]) + np.zeros((1, 8, 1))).astype(np.float32)
+    for walls in (True, False):
+        model = small(ballistic=True, walls=walls)
+        torch.nn.init.zeros_(model.network.decode.linears[-1].weight)
+        run = rollout(model, start(truth, model.history), 60)
+        assert run.status == "ok"
+        np.testing.assert_allclose(run.position[-1, :, 0], 0.2 + 65 * 5e-3, atol=1e-5)
+        assert (run.position[-1, :, 1] == 0).all() if walls else (run.position[-1, :, 1] < 0).all()
+
+
 def test_a_constant_error_of_the_acceleration_costs_the_same_at_every_call():
     truth = path(9)
     model = small(noise=0.0, unroll=(3,))
@@ -324,6 +345,7 @@ def test_lengths_in_spacings_and_noise_in_units():
     ("gns", {"latent": -3}, "latent = -3"),
     ("gns", {"inputs": "positions"}, "inputs"),
     ("gns", {"unroll": []}, "unroll"),
+    ("gns", {"walls": True}, "ballistic"),
     ("gns", {"unroll": [1, 0]}, "unroll.1"),
 ])
 def test_bad_settings_are_one_line(name, settings, message):
