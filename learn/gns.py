@@ -26,6 +26,7 @@ from torch.nn import functional as F
 
 from learn.features import Features, InputScaling, random_walk_noise
 from learn.graph import Graph, radius_graph
+from learn.relaxation import Relaxation, relax
 from sim.simulator import SimulationError, Start
 from sim.trajectory import KINEMATIC_TYPE
 
@@ -61,6 +62,7 @@ class Settings(BaseModel):
     # Of products and edge latents; particle latents, sums and weight gradients stay f32. A CPU without bf16 units (AMX, AVX-512 BF16)
     # emulates bf16, many times slower than f32.
     precision: Literal["f32", "bf16"] = "f32"
+    relaxation: Relaxation | None = None  # of rollouts: crowded particles are pushed apart after every call, see learn.relaxation
     edge_cap: float = Field(4.0, gt=1)  # a rollout fails when its edges exceed this multiple of their first number (it clumps)
 
     @model_validator(mode="after")
@@ -344,13 +346,21 @@ class GNS(nn.Module):
         last = self._position[-1]
         acceleration = self.features.acceleration(output, self._position, self._bounds)
         following = 2 * last - self._position[-2] + acceleration
+        known = None
+        if start.kinematic is not None:
+            known = start.kinematic[np.minimum(self._present + 1 + np.arange(stride), len(start.kinematic) - 1)]
+            known = torch.as_tensor(known, dtype=last.dtype, device=last.device)
+            following[self._type == KINEMATIC_TYPE] = known[-1]
+        if self.options.relaxation is not None:
+            fixed = None if known is None else (self._type == KINEMATIC_TYPE).cpu().numpy()
+            relaxed = relax(following.cpu().numpy(), start.bounds, self.spec.spacing, self.options.relaxation, fixed)
+            following = torch.from_numpy(relaxed).to(last.device)
         gravity = torch.as_tensor(start.gravity * (start.frame_step * stride) ** 2, dtype=last.dtype, device=last.device)
         fall = acceleration.to(last.dtype).clamp(gravity.clamp(max=0), gravity.clamp(min=0))
         share = torch.arange(1, stride + 1, dtype=last.dtype, device=last.device)[:, None, None] / stride
         frames = last + share * (following - last) - share * (1 - share) / 2 * fall
-        if start.kinematic is not None:
-            known = np.minimum(self._present + 1 + np.arange(stride), len(start.kinematic) - 1)
-            frames[:, self._type == KINEMATIC_TYPE] = torch.as_tensor(start.kinematic[known], dtype=last.dtype, device=last.device)
+        if known is not None:
+            frames[:, self._type == KINEMATIC_TYPE] = known
         self._position = torch.cat([self._position[1:], frames[-1:]])
         self._present += stride
         return frames.to("cpu", torch.float32).numpy()

@@ -30,6 +30,7 @@ from torch.nn import functional
 
 from learn.dataset import DataSpec, Windows
 from learn.features import random_walk_noise
+from learn.relaxation import Relaxation, relax
 from sim.simulator import Start
 from sim.trajectory import KINEMATIC_TYPE
 
@@ -53,6 +54,7 @@ class GridEmulatorSettings(BaseModel):
     walls: bool = True  # the flight that the network corrects stops at the walls; off: it goes through them
     preview: list[Share] = Field([0.5, 1.0], max_length=8)  # shares of a call after which the network is shown the density that flight leads to
     select: int = Field(0, ge=0)  # windows of a batch that are trained on, half of them drawn by how far they are from flight; 0: all
+    relaxation: Relaxation | None = None  # of rollouts: crowded particles are pushed apart after every call, see learn.relaxation
     floor: float = Field(0.03, gt=0)  # least scale of a frame's loss, in particle spacings: below it the loss would be all noise
 
     @model_validator(mode="after")
@@ -406,7 +408,7 @@ class GridEmulator(nn.Module):
         self._state = torch.from_numpy(known).to(device)
         self._kind = torch.as_tensor(start.particle_type, dtype=torch.int64, device=device)
         self._example = torch.zeros_like(self._kind)
-        self._frame = start.present
+        self._frame, self._bounds = start.present, np.asarray(start.bounds, np.float64)
         self._context = None if start.context is None else torch.as_tensor(start.context, dtype=torch.float32, device=device)
         self._kinematic = None if start.kinematic is None else torch.as_tensor(start.kinematic, dtype=torch.float32, device=device)
 
@@ -419,6 +421,11 @@ class GridEmulator(nn.Module):
         if self._kinematic is not None:
             frames = self._frame + stride * torch.arange(1, len(future) + 1, device=future.device)
             future[:, self._kind == KINEMATIC_TYPE] = self._kinematic[frames.clamp(max=len(self._kinematic) - 1)]
+        if self.options.relaxation is not None:
+            fixed = None if self._kinematic is None else (self._kind == KINEMATIC_TYPE).cpu().numpy()
+            last = future[-1].cpu().numpy().astype(np.float64)
+            moved = relax(last, self._bounds, self.spec.spacing, self.options.relaxation, fixed) - last
+            future = future + torch.from_numpy(moved.astype(np.float32)).to(future.device) * (self.frame / len(future))[:, None]
         before = torch.cat([self._state[-1:], future[:-1]])
         self._state = torch.cat([self._state, future])[-self.options.history :]
         self._frame += stride * len(future)

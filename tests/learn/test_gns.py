@@ -16,6 +16,7 @@ from learn.features import random_walk_noise
 from learn.gns import GNS
 from learn.graph import radius_graph
 from learn.model import build
+from learn.relaxation import Relaxation
 from sim.errors import InputError
 from sim.simulator import Start, rollout
 
@@ -359,3 +360,21 @@ def test_settings_are_complete_and_rebuild_the_model():
     again = build("gns", json.loads(json.dumps(model.settings)), spec())
     assert again.settings == model.settings and set(model.settings) == set(GNS.Settings.model_fields)
     again.load_state_dict(model.state_dict())
+
+
+def test_relaxation_pushes_a_clump_apart_in_the_rollout_and_leaves_the_oracle_alone():
+    crowd = 0.5 + 0.02 * np.random.default_rng(0).normal(size=(1, 40, 2))
+    frames = np.repeat(crowd, 6, axis=0).astype(np.float32)
+    given = start(frames, 6)
+    model = small(edge_cap=50.0)
+    with torch.no_grad():
+        model.network.decode.linears[-1].weight.zero_()  # the mean acceleration, whatever happens
+    plain = rollout(model, given, 5).position
+    model.options = model.options.model_copy(update={"relaxation": Relaxation()})
+    relaxed = rollout(model, given, 5).position
+    assert np.std(relaxed[-1], axis=0).min() > 1.2 * np.std(plain[-1], axis=0).max()
+    sparse = path(6, particles=4)
+    model.options = model.options.model_copy(update={"relaxation": None})
+    plain = rollout(model, start(sparse, 6), 3).position
+    model.options = model.options.model_copy(update={"relaxation": Relaxation()})
+    np.testing.assert_array_equal(rollout(model, start(sparse, 6), 3).position, plain)

@@ -288,3 +288,14 @@ def test_parameter_count() -> None:
     model = emulator({"history": 3})
     enter, block, down, up, leave = 9 * 11 * 8 + 8, 9 * 64 + 8, 32 * 8 + 8, 8 * 32 + 32, 8 * 9 + 9
     assert sum(parameter.numel() for parameter in model.parameters()) == enter + 3 * block + down + up + leave
+
+
+def test_relaxation_spreads_a_clump_over_the_frames_of_a_call_and_leaves_flight_alone():
+    crowd = np.repeat(flight(60, 2)[:, :1], 60, axis=1) + np.random.default_rng(4).normal(0, 0.01, (60, 2)).astype(np.float32)
+    plain, relaxed = (rollout(emulator({"relaxation": option}), start(crowd), 4).position for option in (None, {"loops": 2}))
+    moved = relaxed - plain
+    assert np.abs(moved[-1]).max() > 1e-3
+    np.testing.assert_allclose(moved, moved[-1] * np.array([0.25, 0.5, 0.75, 1.0])[:, None, None], atol=1e-6)
+    spray = flight(20, 2, seed=5)
+    plain, relaxed = (rollout(emulator({"relaxation": option}), start(spray), 8).position for option in (None, {}))
+    np.testing.assert_array_equal(plain, relaxed)
