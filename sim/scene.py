@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 from scipy.spatial import ConvexHull, cKDTree
 
 from sim.errors import InputError
@@ -35,26 +35,88 @@ class _Strict(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
+def _only(low: float, high: float, remedy: str) -> AfterValidator:
+    """low <= value < high, or an error with this remedy."""
+
+    def check(value: float) -> float:
+        if not low <= value < high:
+            raise _mistake("", value, remedy)
+        return value
+
+    return AfterValidator(check)
+
+
+#: Shear yield stress, cohesion or viscosity: from nothing to more than any particle will feel, but within float32.
+_Resistance = Annotated[Finite, _only(0, 1e30, "must not be negative, nor 1e30 or more (0 means none)")]
+
+
+_PoissonRatio = Annotated[Finite, _only(0, 0.5, "must lie in 0 .. 0.4999: at 1/2 a solid is incompressible and its wave speed infinite")]
+
+
 class Water(_Strict):
-    """Weakly compressible water, Tait pressure p = (rho0 c^2 / gamma) (J^-gamma - 1) (Batchelor 1967; Monaghan 1994, eq. 3)."""
+    """Weakly compressible water, Tait pressure p = (rho0 c^2 / gamma) (J^-gamma - 1) (Batchelor 1967; Monaghan 1994, eq. 3).
+
+    viscosity [Pa s]: dynamic, at reference density."""
 
     model: Literal["water"]
     density: Positive = 1000.0
     sound_speed: Positive
     gamma: Annotated[float, Field(ge=1, le=10)] = 7.0
+    viscosity: _Resistance = 0.0
 
 
-class Sand(_Strict):
-    """Cohesionless Drucker-Prager sand on Hencky strain (Klar et al. 2016). young_modulus [Pa], friction_angle [degrees]."""
+class _Solid(_Strict):
+    """density [kg/m^3], young_modulus [Pa]."""
+
+    density: Positive
+    young_modulus: Positive
+    poisson_ratio: _PoissonRatio = 0.3
+
+
+class Sand(_Solid):
+    """Drucker-Prager sand on Hencky strain (Klar et al. 2016). friction_angle [degrees], cohesion [Pa]."""
 
     model: Literal["sand"]
     density: Positive = 1800.0
-    young_modulus: Positive
-    poisson_ratio: Annotated[float, Field(ge=0, lt=0.5)] = 0.3
-    friction_angle: Annotated[float, Field(ge=0, lt=90)]
+    friction_angle: Annotated[Finite, _only(0, 90, "must lie in 0 .. 89 degrees: at 90 no slope would ever yield")]
+    cohesion: _Resistance = 0.0
+
+    @model_validator(mode="after")
+    def _has_a_tip(self) -> Sand:
+        if self.cohesion and self.friction_angle < 1:
+            raise _mistake("cohesion", self.cohesion, "needs a friction_angle of at least 1 degree, lest it carry any tension; use goop for less")
+        return self
 
 
-Material = Annotated[Water | Sand, Field(discriminator="model")]
+class Goop(_Solid):
+    """Von Mises viscoplastic goop on Hencky strain (Simo & Hughes 1998). yield_stress [Pa]: in shear, 0 is a fluid; viscosity [Pa s]."""
+
+    model: Literal["goop"]
+    density: Positive = 1000.0
+    yield_stress: _Resistance
+    viscosity: _Resistance = 0.0
+
+
+class Elastic(_Solid):
+    """Neo-Hookean rubber (Bonet & Wood 2008)."""
+
+    model: Literal["elastic"]
+    density: Positive = 1000.0
+
+
+class Snow(_Solid):
+    """Hardening snow (Stomakhin et al. 2013, table 2): singular values are held in [1 - critical_compression, 1 + critical_stretch]."""
+
+    model: Literal["snow"]
+    density: Positive = 400.0
+    young_modulus: Positive = 1.4e5
+    poisson_ratio: _PoissonRatio = 0.2
+    critical_compression: Annotated[float, Field(gt=0, lt=1)] = 0.025
+    critical_stretch: Annotated[float, Field(gt=0, le=1)] = 0.0075
+    hardening: Annotated[float, Field(ge=0, le=30)] = 10.0
+
+
+Material = Annotated[Water | Sand | Goop | Elastic | Snow, Field(discriminator="model")]
 
 
 class BoxShape(_Strict):

@@ -88,7 +88,7 @@ class _Kernels:
         factor = -4.0 * dt * volume / dx
         if ti.static(self.dim == 2):
             G = ti.Matrix.cols([ti.Vector([self.C[0][p][0], self.C[0][p][1]]), ti.Vector([self.C[1][p][0], self.C[1][p][1]])])
-            tau = factor * self.materials[m].kirchhoff(p, dt * G)
+            tau = factor * self.materials[m].kirchhoff(p, dt * G, dt)
             P0 = (mass * dx) * self.C[0][p] + tau[0, 0] * E0 + tau[1, 0] * E1
             P1 = (mass * dx) * self.C[1][p] + tau[0, 1] * E0 + tau[1, 1] * E1
             Q = mass * self.v[p] - fx[0] * P0 - fx[1] * P1
@@ -99,7 +99,7 @@ class _Kernels:
                     self.grid[base[0] + i, base[1] + j] += wy[j] * (R + float(j) * T)
         else:
             G = ti.Matrix.cols([ti.Vector([self.C[a][p][0], self.C[a][p][1], self.C[a][p][2]]) for a in ti.static(range(3))])
-            tau = factor * self.materials[m].kirchhoff(p, dt * G)
+            tau = factor * self.materials[m].kirchhoff(p, dt * G, dt)
             P0 = (mass * dx) * self.C[0][p] + tau[0, 0] * E0 + tau[1, 0] * E1 + tau[2, 0] * E2
             P1 = (mass * dx) * self.C[1][p] + tau[0, 1] * E0 + tau[1, 1] * E1 + tau[2, 1] * E2
             P2 = (mass * dx) * self.C[2][p] + tau[0, 2] * E0 + tau[1, 2] * E1 + tau[2, 2] * E2
@@ -446,7 +446,7 @@ class MPMSimulator:
         cell = np.clip((position - lower) / self.dx + WALL, WALL + HAIR, WALL + cells - HAIR)
         data = np.ascontiguousarray(np.concatenate([cell, particles.velocity], 1).astype(np.float32))
         kernels.load(data, self._table(scene, particles, cells))
-        self._cfl = self.settings["cfl"] or scene.cfl
+        self._cfl, self._least = self.settings["cfl"] or scene.cfl, self._fewest(scene, self.dx)
         self._position = np.zeros((len(position), scene.dim), np.float32)
         self._run(0, 0.0, keep=True)
         if fresh:
@@ -454,8 +454,8 @@ class MPMSimulator:
             self.compile_seconds += time.perf_counter() - begun
 
     def _table(self, scene: Scene, particles: Particles, cells: np.ndarray) -> np.ndarray:
-        """All numbers of a scene that kernels need, [6 + materials, 8] float32, a row a thing."""
-        table = np.zeros((6 + len(scene.materials), 8))
+        """All numbers of a scene that kernels need, [6 + materials, 12] float32, a row a thing."""
+        table = np.zeros((6 + len(scene.materials), 12))
         dim, friction, volume = scene.dim, scene.walls.friction, particles.spacing**scene.dim
         table[0, :2] = self.dx, 0.0 if friction == "sticky" else friction
         table[1, :dim], table[2, :dim] = np.array(scene.bounds)[:, 0], scene.gravity
@@ -485,6 +485,11 @@ class MPMSimulator:
         friction = scene.walls.friction
         return scene.dim, models, "sticky" if friction == "sticky" else "coulomb" if friction > 0 else "slip"
 
+    def _fewest(self, scene: Scene, dx: float) -> int:
+        """Substeps a frame that the materials' own bounds ask for."""
+        step = min(MODELS[material.model].largest_step(material, scene.dim, dx) for material in scene.materials.values())
+        return max(1, int(np.ceil(scene.frame_step / step)))
+
     def plan(self, scene: Scene) -> dict:
         """What ``load`` would build for a scene, without building it.
 
@@ -498,9 +503,10 @@ class MPMSimulator:
         n, nodes = _power_of_two(len(particles.position)), int(np.prod(cells + 2 * WALL + 1))
         particle_fields = {"x": dim, "v": 4, **{f"C{axis}": 4 for axis in range(dim)}}
         left_out = {"third dimension": "a 2D scene"} if dim == 2 else {}
-        for name, *_ in models:
-            particle_fields |= {f"{name}.{field}": width for field, width in MODELS[name].state(dim).items()}
-            left_out |= MODELS[name].left_out
+        for name, material in scene.materials.items():
+            model = MODELS[material.model]
+            particle_fields |= {f"{name}.{field}": width for field, width in model.state(dim).items()}
+            left_out |= {f"{what} of {name}": reason for what, reason in (model.left_out | model.omissions(material)).items()}
         if len(models) == 1:
             left_out["material of a particle"] = "one material"
         left_out["signed distance"] = "no obstacles"
@@ -514,8 +520,8 @@ class MPMSimulator:
         gravity = float(np.linalg.norm(scene.gravity))
         start = float(np.sqrt((particles.velocity**2).sum(1).max()))
         fall = float(np.sqrt(start**2 + 2 * gravity * np.linalg.norm(upper - lower)))
-        limit = (self.settings["cfl"] or scene.cfl) * dx
-        substeps = [max(1, int(np.ceil(scene.frame_step * (max(speeds) + v + gravity * scene.frame_step) / limit))) for v in (0.0, fall)]
+        limit, fewest = (self.settings["cfl"] or scene.cfl) * dx, self._fewest(scene, dx)
+        substeps = [max(fewest, int(np.ceil(scene.frame_step * (max(speeds) + v + gravity * scene.frame_step) / limit))) for v in (0.0, fall)]
         return {
             "dim": dim, "materials": [name for name, *_ in models], "walls": friction, "kernels": ["load", "restore", "frame_serial"],
             "fields": fields, "left_out": left_out, "bytes": sum(size * count for size, count in fields.values()),
@@ -536,12 +542,12 @@ class MPMSimulator:
     def frame(self) -> np.ndarray:
         """Advance one frame; positions of the recorded particles, [n, dim] float32. Raises ``SimulationError``.
 
-        dt <= cfl dx / (c + |v|) with the current wave speed and the speed that gravity can add within the frame; substeps
-        divide the frame exactly. A frame whose Courant number outgrew the plan is taken back and repeated with half the step.
+        dt <= cfl dx / (c + |v|) with the current wave speed and the speed that gravity can add within the frame, and the
+        materials' own bounds (viscosity); substeps divide the frame exactly. A frame whose Courant number outgrew the plan is taken back and repeated with half the step.
         """
         kernels, scene, known = self._kernels, self._scene, self._diagnostics
         reach = float(np.linalg.norm(scene.gravity)) * scene.frame_step
-        substeps = max(1, int(np.ceil(scene.frame_step * (known["wave_speed"] + known["max_speed"] + reach) / (self._cfl * self.dx))))
+        substeps = max(self._least, int(np.ceil(scene.frame_step * (known["wave_speed"] + known["max_speed"] + reach) / (self._cfl * self.dx))))
         for attempt in range(MAX_HALVINGS + 1):
             dt = scene.frame_step / substeps
             sums = self._run(substeps, dt, keep=attempt == 0)
