@@ -52,6 +52,7 @@ def _parser() -> argparse.ArgumentParser:
     command = commands.add_parser("info", help="summary of a data set folder, a shard or a scene file")
     command.set_defaults(run=_info)
     command.add_argument("path", type=Path)
+    command.add_argument("--against-paper", action="store_true", help="a data set beside the published domain that its scene reproduces")
 
     command = commands.add_parser("validate", help="check every trajectory of a data set folder or a shard; one line for each fault")
     command.set_defaults(run=_validate)
@@ -104,8 +105,9 @@ def _plan(options: argparse.Namespace) -> int:
 
 def _info(options: argparse.Namespace) -> int:
     from sim.info import info_text
+    from sim.paper import against_paper
 
-    print(info_text(options.path))
+    print((against_paper if options.against_paper else info_text)(options.path))
     return 0
 
 
