@@ -16,7 +16,8 @@ def dataset(path, scene="waterdrop", **statistics):
         "velocity_std": [1.372e-3, 1.312e-3], "acceleration_std": [6.74e-5, 8.70e-5], "particles": [800, 1000.0, 1200], "frames": 1001,
         "neighbours": 12.0,
     }
-    content = {"format_version": 1, "scene": scene, "family": {"frame_step": 0.0025, "radius": 0.015}, "splits": {}, "statistics": found | statistics}
+    family = {"frame_step": 0.0025, "radius": 0.015}
+    content = {"format_version": 1, "scene": scene, "family": family, "seed": 0, "shard_size": 8, "splits": {}, "statistics": found | statistics}
     path.mkdir(exist_ok=True)
     (path / "dataset.json").write_text(json.dumps(content))
     return path
