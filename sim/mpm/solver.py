@@ -542,8 +542,9 @@ class MPMSimulator:
     def frame(self) -> np.ndarray:
         """Advance one frame; positions of the recorded particles, [n, dim] float32. Raises ``SimulationError``.
 
-        dt <= cfl dx / (c + |v|) with the current wave speed and the speed that gravity can add within the frame, and the
-        materials' own bounds (viscosity); substeps divide the frame exactly. A frame whose Courant number outgrew the plan is taken back and repeated with half the step.
+        dt <= cfl dx / (c + |v|) with the current wave speed and the speed that gravity can add within the frame, and the materials'
+        own bounds (viscosity); substeps divide the frame exactly. A frame whose Courant number outgrew the plan is taken back and
+        repeated with half the step.
         """
         kernels, scene, known = self._kernels, self._scene, self._diagnostics
         reach = float(np.linalg.norm(scene.gravity)) * scene.frame_step
@@ -559,6 +560,29 @@ class MPMSimulator:
                 kernels.restore()
                 substeps *= 2
         raise SimulationError(f"time step fell below {dt:.3g} s without a finite, stable frame")
+
+    def state(self) -> dict[str, np.ndarray]:
+        """All simulated particles, in float64: ``position`` [length], ``velocity`` [length/s], [n, dim] each, ``velocity gradient`` [1/s]
+        [n, dim, dim], and what materials carry, named as in ``plan``: [particles of that material] or [particles of that material, floats]."""
+        kernels, scene, n = self._kernels, self._scene, len(self._position)
+        lower, ends = np.array(scene.bounds)[:, 0], kernels.range.to_numpy()
+        found = {"position": lower + (kernels.x.to_numpy()[:n].astype(float) - WALL) * self.dx}
+        found["velocity"] = kernels.v.to_numpy()[:n, : scene.dim].astype(float)
+        found["velocity gradient"] = np.stack([column.to_numpy()[:n, : scene.dim] for column in kernels.C], -1).astype(float)
+        for m, ((name, material), model) in enumerate(zip(scene.materials.items(), kernels.materials, strict=True)):
+            for key, field in zip(MODELS[material.model].state(scene.dim), model.fields(), strict=True):
+                found[f"{name}.{key}"] = field.to_numpy()[ends[m] : ends[m + 1]].astype(float)
+        return found
+
+    def set_velocity(self, velocity: np.ndarray) -> None:
+        """Replace the velocities [n, dim] of all particles; affine parts become zero. For starts that no scene describes."""
+        kernels, (n, dim) = self._kernels, velocity.shape
+        lanes = np.zeros((kernels.capacity, 4), np.float32)
+        for column in kernels.C:
+            column.from_numpy(lanes)
+        lanes[:n, :dim], lanes[:n, dim] = velocity, 1.0
+        kernels.v.from_numpy(lanes)
+        self._run(0, 0.0, keep=True)
 
     def diagnostics(self) -> dict[str, float]:
         """Energies [J per unit depth in 2D], max speed and wave speed [m/s], substeps and dt [s] of the current frame."""

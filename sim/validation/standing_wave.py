@@ -1,50 +1,38 @@
-"""Frequency of a standing gravity wave."""
-
-from __future__ import annotations
+"""Standing wave: a gravity wave in a tank swings at omega^2 = g k tanh(k H)."""
 
 import numpy as np
-from scipy.optimize import curve_fit
 
 from sim.mpm.solver import MPMSimulator
-from sim.validation.case import Case, Clock, G, Result, box, scene, set_motion, state
+from sim.validation import Curve, Outcome, period, scene, timed
+
+NUMBER = 10
+#: Cells along the tank; it is half as deep.
+RESOLUTIONS = (16, 32, 64)
+LENGTH, DEPTH, C, G = 1.0, 0.5, 30.0, 9.8
+PERIODS, FRAMES_A_PERIOD = 3, 60
 
 
-def run(resolution: int) -> Result:
-    """Half a wave in a tank as long as two depths, set going by the velocities of the linear mode; three periods.
+def run(resolution: int) -> Outcome:
+    """Half a wave along the tank, set going by the velocities of the linear mode, phi ~ cosh(k y) cos(k x); 1 % of the depth high.
 
-    phi ~ cosh(k y) cos(k x), k = pi / L; the particles' velocities are projected onto the mode where they started (the amplitude is 1 %
-    of the depth), and a damped cosine is fitted.
+    The particles' velocities are projected onto the mode where they started.
     """
-    length, depth, c = 1.0, 0.5, 30.0
-    k = np.pi / length
-    omega = np.sqrt(G * k * np.tanh(k * depth))
-    period, clock, solver = 2 * np.pi / omega, Clock(), MPMSimulator()
-    frames = 240
-    solver.load(scene({"model": "water", "sound_speed": c}, [box([0.0, 0.0], [length, depth])], resolution, frame_step=3 * period / frames))
-    x = state(solver)[0]
-    amplitude = 0.01 * depth * omega / np.sinh(k * depth)
-    cosh, sinh, cos, sin = np.cosh(k * x[:, 1]), np.sinh(k * x[:, 1]), np.cos(k * x[:, 0]), np.sin(k * x[:, 0])
-    mode = np.stack([-sin * cosh, cos * sinh], 1)
-    gradient = k * np.stack([np.stack([-cos * cosh, -sin * sinh], 1), np.stack([-sin * sinh, cos * cosh], 1)], 1)
-    set_motion(solver, amplitude * mode, amplitude * gradient)
-    norm = amplitude * (mode**2).sum()
-    swing = [1.0]
-    for _ in clock.frames(solver, frames):
-        swing.append(float((state(solver)[1] * mode).sum() / norm))
-    t = np.linspace(0, 3 * period, frames + 1)
-
-    def damped(t: np.ndarray, frequency: float, decay: float, size: float) -> np.ndarray:
-        return size * np.exp(-decay * t) * np.cos(frequency * t)
-
-    (frequency, decay, _), _ = curve_fit(damped, t, swing, (omega, 0.0, 1.0))
-    error = float(abs(frequency / omega - 1))
-    return Result(
-        resolution, error, f"omega {frequency:.3f} ({omega:.3f}) rad/s, decay {decay:.2f} /s", (t / period, np.array(swing)),
-        (t / period, np.cos(omega * t)), clock.seconds,
-    )
-
-
-CASE = Case(
-    10, "standing_wave", "Standing gravity wave", "omega^2 = g k tanh(k H) (linear theory)", "frequency, relative", 0.03,
-    ("t / T", "amplitude of the mode"), (16, 32, 64), "cells along the tank (depth: half of it)", run,
-)
+    k = np.pi / LENGTH
+    omega = np.sqrt(G * k * np.tanh(k * DEPTH))
+    exact = 2 * np.pi / omega
+    what = scene(
+        "standing-wave", {"model": "water", "sound_speed": C}, [{"kind": "box", "lower": [0.0, 0.0], "upper": [LENGTH, DEPTH]}],
+        [[0.0, LENGTH], [0.0, 1.0]], [resolution, round(resolution / LENGTH)], exact / FRAMES_A_PERIOD, gravity=[0.0, -G],
+    )  # fmt: skip
+    solver = MPMSimulator()
+    solver.load(what)
+    x, y = what.particles().position.T
+    mode = np.stack([-np.sin(k * x) * np.cosh(k * y), np.cos(k * x) * np.sinh(k * y)], 1)
+    size = 0.01 * DEPTH * omega / np.sinh(k * DEPTH)
+    solver.set_velocity(size * mode)
+    swing, seconds = timed(solver.frame, PERIODS * FRAMES_A_PERIOD, lambda _: (solver.state()["velocity"] * mode).sum() / (size * (mode**2).sum()))
+    t = what.frame_step * np.arange(1, len(swing) + 1)
+    found = period(t, np.array(swing), exact)
+    curve = Curve(f"frequency; period {found:.4f} s, exact {exact:.4f} s", ("time / T", "amplitude of the mode"), t / exact, np.cos(omega * t),
+                  np.array(swing), float(exact / found - 1), 0.03)  # fmt: skip
+    return Outcome("standing_wave", resolution, len(x), {"frequency": curve}, seconds)

@@ -3,20 +3,27 @@
 Tolerances are counted in eps = 1.2e-7, the spacing of float32 at 1, unless a comment says otherwise.
 """
 
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from sim.generate import simulate
-from sim.mpm import solver as solver_module
-from sim.mpm.decomposition import assemble2, assemble3, decompose2, decompose3, expm1, log1p
-from sim.mpm.materials.sand import SandModel
-from sim.mpm.materials.water import WaterModel
-from sim.mpm.solver import COURANT_GROWTH, MAX_HALVINGS, WALL, MPMSimulator
-from sim.mpm.walls import wall
-from sim.scene import Sand, Scene, Water
-from sim.simulator import SimulationError
-from sim.taichi_runtime import start_taichi, ti
+sys.path.insert(0, str(Path(__file__).parent))
+
+from experiments import Experiments  # noqa: E402
+
+from sim.generate import simulate  # noqa: E402
+from sim.mpm import solver as solver_module  # noqa: E402
+from sim.mpm.decomposition import assemble2, assemble3, decompose2, decompose3, expm1, log1p  # noqa: E402
+from sim.mpm.materials.sand import SandModel  # noqa: E402
+from sim.mpm.materials.water import WaterModel  # noqa: E402
+from sim.mpm.solver import COURANT_GROWTH, MAX_HALVINGS, WALL, MPMSimulator  # noqa: E402
+from sim.mpm.walls import wall  # noqa: E402
+from sim.scene import Sand, Scene, Water  # noqa: E402
+from sim.simulator import SimulationError  # noqa: E402
+from sim.taichi_runtime import start_taichi, ti  # noqa: E402
 
 EPS = float(np.finfo(np.float32).eps)
 array1, array2, array3 = ti.types.ndarray(ti.f32, 1), ti.types.ndarray(ti.f32, 2), ti.types.ndarray(ti.f32, 3)
@@ -141,39 +148,6 @@ def test_log1p_and_expm1_keep_the_digits_of_small_arguments():
 
 
 # -- materials: each particle is an experiment of its own
-
-
-@ti.data_oriented
-class Experiments:
-    """Particles of one material, without a grid: prescribed velocity gradients in, stresses out."""
-
-    def __init__(self, model, dim, n, *options):
-        self.model, self.dim, self.n = model(dim, n, *options), dim, n
-        self.tau, self.energy, self.speed = np.zeros((n, dim, dim), np.float32), np.zeros(n, np.float32), np.zeros(n, np.float32)
-
-    def set(self, material):
-        self.model.parameters.from_numpy(np.array(self.model.numbers(material, self.dim, 1.0), np.float32))
-
-    def strain(self, gradient):
-        """One step with these [n, dim, dim] gradients times dt; returns tau [n, dim, dim] in float64."""
-        self.step(np.ascontiguousarray(gradient, np.float32), self.tau, self.energy, self.speed)
-        return self.tau.astype(float)
-
-    @ti.kernel
-    def step(self, gradient: array3, tau: array3, energy: array1, speed: array1):
-        for p in range(self.n):
-            G = ti.Matrix.zero(ti.f32, self.dim, self.dim)
-            for i, j in ti.static(ti.ndrange(self.dim, self.dim)):
-                G[i, j] = gradient[p, i, j]
-            stress = self.model.kirchhoff(p, G, 1.0)
-            for i, j in ti.static(ti.ndrange(self.dim, self.dim)):
-                tau[p, i, j] = stress[i, j]
-            energy[p], speed[p] = self.model.energy_density(p), self.model.wave_speed(p)
-
-    @ti.kernel
-    def reset(self):
-        for p in range(self.n):
-            self.model.reset(p)
 
 
 N = 4096

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from sim.mpm.decomposition import pack, unpack
-from sim.mpm.materials.strain import Principal, growth, lame, log1p
+from sim.mpm.decomposition import log1p, unpack
+from sim.mpm.materials.strain import Principal, growth, lame
 from sim.taichi_runtime import ti
 
 
