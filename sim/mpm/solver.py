@@ -9,13 +9,15 @@ Decisions, measured on a CPU:
 """
 
 import time
+from dataclasses import dataclass
 
 import numpy as np
 
 from sim.errors import InputError
 from sim.mpm.decomposition import finite
 from sim.mpm.materials import MODELS
-from sim.mpm.walls import wall
+from sim.mpm.walls import solid, wall
+from sim.obstacles import THINNEST, combine
 from sim.scene import Particles, Scene
 from sim.simulator import Kind, SimulationError, Start
 from sim.taichi_runtime import start_taichi, ti
@@ -33,6 +35,20 @@ HAIR = 1e-4
 #: What a frame adds up: kinetic, potential, elastic energy; the largest of squared speed, wave speed, squared speed within the frame;
 #: particles that are not finite.
 SUMS = 7
+#: Friction coefficient that stands for ``sticky`` in the obstacles' field.
+STICKY = -1.0
+
+
+@dataclass(frozen=True)
+class Structure:
+    """What is compiled in. models: (material, *options) each; friction: the walls' "slip", "coulomb" or "sticky"; obstacles: "none",
+    "slip" or "coulomb" (which includes sticky ones); shaken: gravity changes from frame to frame."""
+
+    dim: int
+    models: tuple
+    friction: str
+    obstacles: str = "none"
+    shaken: bool = False
 
 
 def _power_of_two(n: int) -> int:
@@ -41,7 +57,7 @@ def _power_of_two(n: int) -> int:
 
 @ti.data_oriented
 class _Kernels:
-    """Fields and compiled code for one structure: dimension, materials present, wall kind; capacities in particles and nodes.
+    """Fields and compiled code for one ``Structure``; capacities in particles and nodes.
 
     Vectors that meet in the transfers have four equal lanes whatever the dimension: a node is (momentum, mass, 0), later (velocity, 1, 0);
     a particle's velocity carries the gathered 1 along. Uniform lanes are what the compiler turns into vector instructions; shorter
@@ -50,8 +66,10 @@ class _Kernels:
     Positions are stored in cells, from the padded corner.
     """
 
-    def __init__(self, dim: int, models: tuple, friction: str, capacity: int, nodes: tuple[int, ...], serial: bool):
-        self.dim, self.models, self.friction, self.capacity, self.nodes = dim, models, friction, capacity, nodes
+    def __init__(self, structure: Structure, capacity: int, nodes: tuple[int, ...], serial: bool):
+        self.structure, self.capacity, self.nodes = structure, capacity, nodes
+        dim, models = self.dim, self.models = structure.dim, structure.models
+        self.friction = structure.friction
         self.x = ti.Vector.field(dim, ti.f32, capacity)
         self.v = ti.Vector.field(4, ti.f32, capacity)
         self.C = [ti.Vector.field(4, ti.f32, capacity) for _ in range(dim)]  # column a: derivative of the velocity along axis a
@@ -62,6 +80,10 @@ class _Kernels:
         self.extent = ti.Vector.field(dim, ti.i32, 2)  # node indices of the walls
         self.dx, self.coefficient = ti.field(ti.f32, ()), ti.field(ti.f32, ())
         self.lower, self.gravity = ti.Vector.field(dim, ti.f32, ()), ti.Vector.field(dim, ti.f32, ())
+        #: Gravity as the box feels it in the current frame.
+        self.pull = ti.Vector.field(dim, ti.f32, ()) if structure.shaken else self.gravity
+        if structure.obstacles != "none":
+            self.solids = ti.Vector.field(dim + 2, ti.f32, nodes)  # normal, distance in cells, friction of the nearest obstacle
         self.E = ti.Vector.field(4, ti.f32, 3)
         self.state = [self.x, self.v, *self.C, *(field for material in self.materials for field in material.fields())]
         self.saved = [
@@ -115,17 +137,24 @@ class _Kernels:
 
     @ti.func
     def update_node(self, I, dt):
-        """Momentum to velocity, gravity, walls."""
+        """Momentum to velocity, gravity, walls, obstacles."""
         cell = self.grid[I]
         if cell[self.dim] > 0.0:
             inverse = 1.0 / cell[self.dim]
             v = ti.Vector.zero(ti.f32, self.dim)
             for d in ti.static(range(self.dim)):
-                v[d] = cell[d] * inverse + dt * self.gravity[None][d]
+                v[d] = cell[d] * inverse + dt * self.pull[None][d]
             # A name of its own: reassigning v from a function inside a branch is stored with its old value (Taichi 1.7.4).
             u = wall(v, I, self.extent[0], self.extent[1], self.friction, self.coefficient[None])
-            for d in ti.static(range(self.dim)):
-                cell[d] = u[d]
+            if ti.static(self.structure.obstacles != "none"):
+                w = solid(u, self.solids[I], self.structure.obstacles)
+                # The wall once more: an obstacle that leans on it must not push into it.
+                x = wall(w, I, self.extent[0], self.extent[1], self.friction, self.coefficient[None])
+                for d in ti.static(range(self.dim)):
+                    cell[d] = x[d]
+            else:
+                for d in ti.static(range(self.dim)):
+                    cell[d] = u[d]
             cell[self.dim] = 1.0
             self.grid[I] = cell
 
@@ -152,7 +181,7 @@ class _Kernels:
                 r0, r1 = self.grid[held][d] + 2.0 * self.grid[ghost][d], self.grid[inner][d] - self.grid[ghost][d]
                 free[d] = ((m1 + m) * r0 + 2.0 * m * r1) / det
                 fixed[d] = ((m0 + 4.0 * m) * r1 + 2.0 * m * r0) / det
-            fall = free + dt * self.gravity[None]
+            fall = free + dt * self.pull[None]
             u = wall(fall, held, self.extent[0], self.extent[1], self.friction, self.coefficient[None])
             for d in ti.static(range(self.dim)):
                 self.grid[held][d] = m0 * free[d]
@@ -247,7 +276,50 @@ class _Kernels:
                 v[d] = 0.0
             x[d] = inside
         self.x[p], self.v[p] = x, v
+        if ti.static(self.structure.obstacles != "none"):
+            self.push_out(p)
         return speed2
+
+    @ti.func
+    def clearance(self, x):
+        """Distance [cells] to the obstacles and unit normal at a place inside the box, multilinear in the nodes' values.
+
+        Between nodes the normals are averaged and stretched to length 1 again; on the middle line of a plate they cancel, and it stays 0.
+        """
+        low = ti.cast(x, ti.i32)
+        f = x - ti.cast(low, ti.f32)
+        normal, distance = ti.Vector.zero(ti.f32, self.dim), 0.0
+        for corner in ti.static(range(2**self.dim)):
+            at, weight = low, 1.0
+            for d in ti.static(range(self.dim)):
+                at[d] += ti.static(corner >> d & 1)
+                weight *= f[d] if ti.static(corner >> d & 1) else 1.0 - f[d]
+            value = self.solids[at]
+            distance += weight * value[self.dim]
+            for d in ti.static(range(self.dim)):
+                normal[d] += weight * value[d]
+        return distance, normal / ti.max(normal.norm(), 1e-6)
+
+    @ti.func
+    def push_out(self, p):
+        """A particle inside an obstacle goes back along the normal and loses its velocity into it. Twice, for a notch between two slopes."""
+        for _ in ti.static(range(2)):
+            distance, normal = self.clearance(self.x[p])
+            if distance < HAIR:
+                approach = 0.0
+                for d in ti.static(range(self.dim)):
+                    approach += self.v[p][d] * normal[d]
+                for d in ti.static(range(self.dim)):
+                    self.v[p][d] -= ti.min(approach, 0.0) * normal[d]
+                    moved = self.x[p][d] + (HAIR - distance) * normal[d]
+                    self.x[p][d] = ti.min(ti.max(moved, ti.cast(self.extent[0][d], ti.f32) + HAIR), ti.cast(self.extent[1][d], ti.f32) - HAIR)
+
+    @ti.func
+    def shake(self, sums: ti.template()):
+        """What bodies feel in a box of acceleration a is gravity - a; a stands behind the ``SUMS``."""
+        for _ in range(1):
+            for d in ti.static(range(self.dim)):
+                self.pull[None][d] = self.gravity[None][d] - ti.cast(sums[SUMS + d], ti.f32)
 
     @ti.func
     def report(self, m: ti.template(), p, position: ti.template(), sums: ti.template()):
@@ -274,6 +346,8 @@ class _Kernels:
         self, substeps: ti.i32, dt: ti.f32, keep: ti.i32, position: ti.types.ndarray(ti.f32, 2), sums: ti.types.ndarray(ti.f64, 1)
     ):
         """A whole frame; ``keep`` saves the state first. Only the box of nodes that particles touch is swept."""
+        if ti.static(self.structure.shaken):
+            self.shake(sums)
         ti.loop_config(serialize=True)
         for p in range(keep * self.range[ti.static(len(self.models))]):
             self.save_particle(p)
@@ -324,6 +398,8 @@ class _Kernels:
 
     @ti.kernel
     def substep_parallel(self, dt: ti.f32, sums: ti.types.ndarray(ti.f64, 1)):
+        if ti.static(self.structure.shaken):
+            self.shake(sums)
         for m in ti.static(range(len(self.models))):
             for p in range(self.range[m], self.range[m + 1]):
                 base, fx = self.locate(self.x[p])
@@ -380,6 +456,16 @@ class _Kernels:
         for I in ti.grouped(self.grid):
             self.grid[I] = ti.Vector.zero(ti.f32, 4)
 
+    @ti.kernel
+    def load_solids(self, values: ti.types.ndarray(ti.f32, 2)):
+        """[nodes, dim + 2] in the order of the grid's indices."""
+        for I in ti.grouped(self.solids):
+            row = 0
+            for d in ti.static(range(self.dim)):
+                row = row * ti.static(self.nodes[d]) + I[d]
+            for lane in ti.static(range(self.dim + 2)):
+                self.solids[I][lane] = values[row, lane]
+
     @ti.func
     def save_particle(self, p):
         for f in ti.static(range(len(self.state))):
@@ -397,6 +483,11 @@ class _Kernels:
                 self.state[f][p] = self.saved[f][p]
         for I in ti.grouped(self.grid):
             self.grid[I] = ti.Vector.zero(ti.f32, 4)
+
+
+def _frictions(scene: Scene) -> list:
+    """Of each obstacle; the walls' unless it has its own."""
+    return [scene.walls.friction if obstacle.friction is None else obstacle.friction for obstacle in scene.obstacles]
 
 
 class MPMSimulator:
@@ -431,8 +522,8 @@ class MPMSimulator:
         structure, nodes = self._structure(scene), tuple(int(c) + 2 * WALL + 1 for c in self._cells(scene))
         capacity = _power_of_two(len(particles.position))
         old, fresh = self._kernels, False
-        if old is None or (old.dim, old.models, old.friction) != structure or old.nodes != nodes or old.capacity < capacity:
-            self._kernels, fresh = _Kernels(*structure, capacity, nodes, serial), True
+        if old is None or old.structure != structure or old.nodes != nodes or old.capacity < capacity:
+            self._kernels, fresh = _Kernels(structure, capacity, nodes, serial), True
         kernels = self._kernels
         lower, upper = np.array(scene.bounds).T
         cells = self._cells(scene)
@@ -446,6 +537,9 @@ class MPMSimulator:
         cell = np.clip((position - lower) / self.dx + WALL, WALL + HAIR, WALL + cells - HAIR)
         data = np.ascontiguousarray(np.concatenate([cell, particles.velocity], 1).astype(np.float32))
         kernels.load(data, self._table(scene, particles, cells))
+        if structure.obstacles != "none":
+            kernels.load_solids(self._solids(scene, nodes))
+        self._acceleration, self._frame, self._boundary = scene.acceleration(), 0, scene.boundary.astype(np.float32)
         self._cfl = self.settings["cfl"] or scene.cfl
         self._position = np.zeros((len(position), scene.dim), np.float32)
         self._run(0, 0.0, keep=True)
@@ -467,6 +561,14 @@ class MPMSimulator:
             table[row, : 3 + len(numbers)] = end, material.density * volume, volume, *numbers
         return table.astype(np.float32)
 
+    def _solids(self, scene: Scene, nodes: tuple[int, ...]) -> np.ndarray:
+        """Normal, distance [cells] and friction of the obstacles at each node, [nodes, dim + 2] float32."""
+        lower = np.array(scene.bounds)[:, 0]
+        at = lower + (np.stack(np.meshgrid(*[np.arange(n) for n in nodes], indexing="ij"), -1).reshape(-1, scene.dim) - WALL) * self.dx
+        distance, normal, nearest = combine(scene.obstacles, at)
+        friction = np.array([STICKY if kind == "sticky" else kind for kind in _frictions(scene)])[nearest]
+        return np.concatenate([normal, distance[:, None] / self.dx, friction[:, None]], 1).astype(np.float32)
+
     def _refine(self, scene: Scene) -> int:
         return scene.refine if self.settings["particles"] == "teacher" else 1
 
@@ -477,13 +579,19 @@ class MPMSimulator:
         edges = (upper - lower) / cells
         if np.ptp(edges) > 1e-6 * edges[0]:
             raise InputError(scene.name, "coarsen", self.settings["coarsen"], f"does not divide the box's cells {scene.cells} alike")
+        for index, obstacle in enumerate(scene.obstacles):
+            thickness = getattr(obstacle, "thickness", np.inf)
+            if thickness < THINNEST * edges[0] * (1 - 1e-9):
+                remedy = f"thinner than {THINNEST:g} grid cells of {edges[0]:.4g}, so that particles leak through; thicken it or refine the grid"
+                raise InputError(scene.name, f"obstacles[{index}].thickness", thickness, remedy)
         return cells
 
-    def _structure(self, scene: Scene) -> tuple[int, tuple, str]:
-        """What is compiled in: dimension, materials with their options, wall kind."""
+    def _structure(self, scene: Scene) -> Structure:
         models = tuple((material.model, *MODELS[material.model].options(material)) for material in scene.materials.values())
         friction = scene.walls.friction
-        return scene.dim, models, "sticky" if friction == "sticky" else "coulomb" if friction > 0 else "slip"
+        walls = "sticky" if friction == "sticky" else "coulomb" if friction > 0 else "slip"
+        obstacles = "none" if not scene.obstacles else "slip" if all(kind == 0 for kind in _frictions(scene)) else "coulomb"
+        return Structure(scene.dim, models, walls, obstacles, scene.container is not None)
 
     def plan(self, scene: Scene) -> dict:
         """What ``load`` would build for a scene, without building it.
@@ -491,7 +599,8 @@ class MPMSimulator:
         kernels: names; fields: name -> [bytes an entry, entries]; left_out: name -> reason; bytes; particles; recorded; cells;
         substeps_per_frame: (at rest, at the speed of a fall through the whole box).
         """
-        dim, models, friction = self._structure(scene)
+        structure = self._structure(scene)
+        dim, models, friction = structure.dim, structure.models, structure.friction
         particles, cells = scene.particles(self._refine(scene)), self._cells(scene)
         lower, upper = np.array(scene.bounds).T
         dx = float((upper[0] - lower[0]) / cells[0])
@@ -503,28 +612,40 @@ class MPMSimulator:
             left_out |= MODELS[name].left_out
         if len(models) == 1:
             left_out["material of a particle"] = "one material"
-        left_out["signed distance"] = "no obstacles"
-        left_out["context"] = "no moving container, no varying parameter"
+        kernels = ["load", "restore", "frame_serial"]
+        if structure.obstacles == "none":
+            left_out["signed distance"] = "no obstacles"
+        if not structure.shaken:
+            left_out["changing gravity"] = "the container stands still"
+        if structure.obstacles == "slip":
+            left_out["obstacle friction"] = "slip obstacles"
+        context = scene.context_values()
+        if context is None:
+            left_out["context"] = "no moving container, no varying parameter"
         if friction == "slip":
             left_out["wall friction"] = "slip walls"
         fields = {name: (4 * width, n) for name, width in particle_fields.items()}
         fields |= {f"saved {name}": entry for name, entry in fields.items()}
         fields["grid"] = (16, nodes)
+        if structure.obstacles != "none":
+            fields["signed distance"] = (4 * (dim + 2), nodes)
+            kernels.append("load_solids")
         speeds = [MODELS[material.model].rest_wave_speed(material, self.settings["stiffness"]) for material in scene.materials.values()]
-        gravity = float(np.linalg.norm(scene.gravity))
+        gravity = float(np.linalg.norm(np.array(scene.gravity) - scene.acceleration(), axis=1).max())
         start = float(np.sqrt((particles.velocity**2).sum(1).max()))
         fall = float(np.sqrt(start**2 + 2 * gravity * np.linalg.norm(upper - lower)))
         limit = (self.settings["cfl"] or scene.cfl) * dx
         substeps = [max(1, int(np.ceil(scene.frame_step * (max(speeds) + v + gravity * scene.frame_step) / limit))) for v in (0.0, fall)]
         return {
-            "dim": dim, "materials": [name for name, *_ in models], "walls": friction, "kernels": ["load", "restore", "frame_serial"],
-            "fields": fields, "left_out": left_out, "bytes": sum(size * count for size, count in fields.values()),
-            "particles": len(particles.position), "recorded": len(particles.tracked), "cells": cells.tolist(), "grid_spacing": dx,
-            "wave_speed": max(speeds), "substeps_per_frame": substeps,
+            "dim": dim, "materials": [name for name, *_ in models], "walls": friction, "obstacles": len(scene.obstacles),
+            "context": 0 if context is None else context.shape[1], "kernels": kernels, "fields": fields, "left_out": left_out,
+            "bytes": sum(size * count for size, count in fields.values()), "particles": len(particles.position),
+            "recorded": len(particles.tracked) + len(scene.boundary), "kinematic": len(scene.boundary), "cells": cells.tolist(),
+            "grid_spacing": dx, "wave_speed": max(speeds), "substeps_per_frame": substeps,
         }
 
     def _run(self, substeps: int, dt: float, keep: bool) -> np.ndarray:
-        sums = np.zeros(SUMS)
+        sums = np.concatenate([np.zeros(SUMS), self._acceleration[min(self._frame, len(self._acceleration) - 1)]])
         self._kernels.frame(substeps, dt, int(keep), self._position, sums)
         kinetic, potential, elastic = sums[:3].tolist()
         self._diagnostics = {
@@ -534,13 +655,14 @@ class MPMSimulator:
         return sums
 
     def frame(self) -> np.ndarray:
-        """Advance one frame; positions of the recorded particles, [n, dim] float32. Raises ``SimulationError``.
+        """Advance one frame; positions of the recorded particles, kinematic ones last, [n, dim] float32. Raises ``SimulationError``.
 
         dt <= cfl dx / (c + |v|) with the current wave speed and the speed that gravity can add within the frame; substeps
         divide the frame exactly. A frame whose Courant number outgrew the plan is taken back and repeated with half the step.
         """
         kernels, scene, known = self._kernels, self._scene, self._diagnostics
-        reach = float(np.linalg.norm(scene.gravity)) * scene.frame_step
+        felt = scene.gravity - self._acceleration[min(self._frame, len(self._acceleration) - 1)]
+        reach = float(np.linalg.norm(felt)) * scene.frame_step
         substeps = max(1, int(np.ceil(scene.frame_step * (known["wave_speed"] + known["max_speed"] + reach) / (self._cfl * self.dx))))
         for attempt in range(MAX_HALVINGS + 1):
             dt = scene.frame_step / substeps
@@ -548,7 +670,8 @@ class MPMSimulator:
             if np.isfinite(sums).all() and sums[6] == 0:
                 speed = float(np.sqrt(max(sums[3], sums[5])))
                 if dt * (speed + sums[4]) <= COURANT_GROWTH * self._cfl * self.dx and dt * speed <= self.dx:
-                    return self._position[self._tracked]
+                    self._frame += 1
+                    return np.concatenate([self._position[self._tracked], self._boundary])
             if attempt < MAX_HALVINGS:
                 kernels.restore()
                 substeps *= 2
