@@ -528,6 +528,7 @@ class _Moments:
 class _ShardStatistics:
     velocity: _Moments = field(default_factory=_Moments)
     acceleration: _Moments = field(default_factory=_Moments)
+    context: _Moments = field(default_factory=_Moments)
     particles: list[int] = field(default_factory=list)
     frames: list[int] = field(default_factory=list)
     neighbours: list[float] = field(default_factory=list)
@@ -542,6 +543,8 @@ def _shard_statistics(path: Path, neighbour_stride: int) -> _ShardStatistics:
             velocity = np.diff(position, axis=0)
             result.velocity.add(velocity)
             result.acceleration.add(np.diff(velocity, axis=0))
+            if trajectory.context is not None:
+                result.context.add(trajectory.context.astype(np.float64))
             result.particles.append(trajectory.position.shape[1])
             result.frames.append(len(position))
             if index % neighbour_stride == 0:
@@ -555,8 +558,8 @@ def training_statistics(shards: list[Path], jobs: int = 1) -> dict | None:
     """Statistics of a training split, streamed over its shards, ``jobs`` at a time; None without a trajectory.
 
     velocity p_t - p_(t-1) and acceleration p_(t+1) - 2 p_t + p_(t-1), length per frame (squared), mean and std per axis in
-    float64 over all frames and moving particles; particles [min, mean, max]; frames (the most); neighbours: mean
-    number of particles within the radius, self included, on a sample of frames.
+    float64 over all frames and moving particles; context (where there is one), over all frames; particles [min, mean, max];
+    frames (the most); neighbours: mean number of particles within the radius, self included, on a sample of frames.
     """
     indices: list[int] = []
     for path in shards:
@@ -567,7 +570,7 @@ def training_statistics(shards: list[Path], jobs: int = 1) -> dict | None:
     stride = max(1, (max(indices) + 1) // _NEIGHBOUR_TRAJECTORIES)
     if not any(index % stride == 0 for index in indices):
         stride = 1
-    velocity, acceleration = _Moments(), _Moments()
+    velocity, acceleration, context = _Moments(), _Moments(), _Moments()
     particles: list[int] = []
     frames: list[int] = []
     neighbours: list[float] = []
@@ -576,10 +579,13 @@ def training_statistics(shards: list[Path], jobs: int = 1) -> dict | None:
         for part in pool.map(lambda path: _shard_statistics(path, stride), shards):
             velocity.merge(part.velocity)
             acceleration.merge(part.acceleration)
+            context.merge(part.context)
             particles += part.particles
             frames += part.frames
             neighbours += part.neighbours
     statistics = dict(zip(("velocity_mean", "velocity_std"), velocity.result(), strict=True))
     statistics |= dict(zip(("acceleration_mean", "acceleration_std"), acceleration.result(), strict=True))
+    if context.count:
+        statistics |= dict(zip(("context_mean", "context_std"), context.result(), strict=True))
     statistics |= {"particles": [min(particles), float(np.mean(particles)), max(particles)], "frames": max(frames)}
     return statistics | {"neighbours": float(np.mean(neighbours))}

@@ -11,7 +11,7 @@ from sim.scene import SceneFamily
 
 #: Particle-substeps per second of one core, by dimension and the slowest material present: the order of a 2-core cloud machine of
 #: 2023. ``make bench`` measures this machine's.
-RATES = {(2, "water"): 12e6, (2, "sand"): 6e6, (3, "water"): 4e6, (3, "sand"): 1.5e6}
+RATES = {(2, "water"): 12e6, (2, "sand"): 6e6, (2, "rigid"): 12e6, (3, "water"): 4e6, (3, "sand"): 1.5e6, (3, "rigid"): 4e6}
 
 #: Scenes drawn to describe a family.
 _SAMPLES = 8

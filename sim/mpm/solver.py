@@ -16,6 +16,7 @@ import numpy as np
 from sim.errors import InputError
 from sim.mpm.decomposition import finite
 from sim.mpm.materials import MODELS
+from sim.mpm.rigid import RigidBodies, body_table
 from sim.mpm.walls import solid, wall
 from sim.obstacles import THINNEST, combine
 from sim.scene import Particles, Scene
@@ -42,13 +43,15 @@ STICKY = -1.0
 @dataclass(frozen=True)
 class Structure:
     """What is compiled in. models: (material, *options) each; friction: the walls' "slip", "coulomb" or "sticky"; obstacles: "none",
-    "slip" or "coulomb" (which includes sticky ones); shaken: gravity changes from frame to frame."""
+    "slip" or "coulomb" (which includes sticky ones); shaken: gravity changes from frame to frame; rigid: (bodies, faces of one) at most,
+    or None."""
 
     dim: int
     models: tuple
     friction: str
     obstacles: str = "none"
     shaken: bool = False
+    rigid: tuple[int, int] | None = None
 
 
 def _power_of_two(n: int) -> int:
@@ -73,6 +76,8 @@ class _Kernels:
         self.x = ti.Vector.field(dim, ti.f32, capacity)
         self.v = ti.Vector.field(4, ti.f32, capacity)
         self.C = [ti.Vector.field(4, ti.f32, capacity) for _ in range(dim)]  # column a: derivative of the velocity along axis a
+        #: Materials whose particles move with the grid.
+        self.flowing = [m for m, (model, *_) in enumerate(models) if model != "rigid"]
         self.materials = [MODELS[model](dim, capacity, *options) for model, *options in models]
         self.grid = ti.Vector.field(4, ti.f32, nodes)
         self.range = ti.field(ti.i32, len(models) + 1)  # particles of material m: range[m] .. range[m + 1]
@@ -89,6 +94,8 @@ class _Kernels:
         self.saved = [
             ti.field(ti.f32, capacity) if isinstance(field, ti.ScalarField) else ti.Vector.field(field.n, ti.f32, capacity) for field in self.state
         ]
+        self.has_rigid = structure.rigid is not None
+        self.rigid = RigidBodies(self, *structure.rigid, capacity) if self.has_rigid else None
         self.frame = self.frame_serial if serial else self.frame_parallel
 
     @ti.func
@@ -302,16 +309,23 @@ class _Kernels:
 
     @ti.func
     def push_out(self, p):
-        """A particle inside an obstacle goes back along the normal and loses its velocity into it. Twice, for a notch between two slopes."""
+        """A particle inside an obstacle goes back along the normal and meets the same condition as a node (``sim.mpm.walls.solid``).
+
+        Nodes outside stay free however near they are, so part of the reaction is missing on the grid; here it is made up, with its
+        friction. Twice, for a notch between two slopes.
+        """
         for _ in ti.static(range(2)):
-            distance, normal = self.clearance(self.x[p])
+            x = self.x[p]
+            distance, normal = self.clearance(x)
             if distance < HAIR:
-                approach = 0.0
+                value, v = ti.Vector.zero(ti.f32, self.dim + 2), ti.Vector.zero(ti.f32, self.dim)
                 for d in ti.static(range(self.dim)):
-                    approach += self.v[p][d] * normal[d]
+                    value[d], v[d] = normal[d], self.v[p][d]
+                value[self.dim + 1] = self.solids[ti.cast(x + 0.5, ti.i32)][self.dim + 1]
+                u = solid(v, value, self.structure.obstacles)
                 for d in ti.static(range(self.dim)):
-                    self.v[p][d] -= ti.min(approach, 0.0) * normal[d]
-                    moved = self.x[p][d] + (HAIR - distance) * normal[d]
+                    self.v[p][d] = u[d]
+                    moved = x[d] + (HAIR - distance) * normal[d]
                     self.x[p][d] = ti.min(ti.max(moved, ti.cast(self.extent[0][d], ti.f32) + HAIR), ti.cast(self.extent[1][d], ti.f32) - HAIR)
 
     @ti.func
@@ -331,6 +345,10 @@ class _Kernels:
             position[p, d] = x
             speed2 += self.v[p][d] ** 2
             height -= self.gravity[None][d] * x
+        if ti.static(self.models[m][0] == "rigid"):
+            # A body's inertia includes the splines' own moments; its energy does too.
+            for a in ti.static(range(self.dim)):
+                speed2 += 0.25 * (self.dx[None] * self.C[a][p]).norm_sqr()
         sums[0] += ti.cast(0.5 * mass * speed2, ti.f64)
         sums[1] += ti.cast(mass * height, ti.f64)
         sums[2] += ti.cast(volume * self.materials[m].energy_density(p), ti.f64)
@@ -351,6 +369,9 @@ class _Kernels:
         ti.loop_config(serialize=True)
         for p in range(keep * self.range[ti.static(len(self.models))]):
             self.save_particle(p)
+        if ti.static(self.has_rigid):
+            for _ in range(keep):
+                self.rigid.keep(False)
         ti.loop_config(serialize=True)
         for _ in range(substeps):
             low, high = ti.Vector([1 << 20] * self.dim), ti.Vector([0] * self.dim)
@@ -359,6 +380,10 @@ class _Kernels:
                     base, fx = self.locate(self.x[p])
                     low, high = ti.min(low, base), ti.max(high, base)
                     self.p2g(m, p, base, fx, dt)
+            fastest = 0.0
+            if ti.static(self.has_rigid):
+                # Bodies read the grid before walls and obstacles change it: these act on the bodies themselves.
+                fastest = self.rigid.step(dt)
             self.at_walls(low, high, dt, before=True)
             if ti.static(self.dim == 2):
                 for i in range(low[0], high[0] + 3):
@@ -370,9 +395,13 @@ class _Kernels:
                         for k in range(low[2], high[2] + 3):
                             self.update_node(ti.Vector([i, j, k]), dt)
             self.at_walls(low, high, dt, before=False)
-            fastest = 0.0
-            for p in range(self.range[ti.static(len(self.models))]):
-                fastest = ti.max(fastest, self.g2p(p, dt))
+            if ti.static(self.has_rigid):
+                for m in ti.static(self.flowing):
+                    for p in range(self.range[m], self.range[m + 1]):
+                        fastest = ti.max(fastest, self.g2p(p, dt))
+            else:
+                for p in range(self.range[ti.static(len(self.models))]):
+                    fastest = ti.max(fastest, self.g2p(p, dt))
             sums[5] = ti.max(sums[5], ti.cast(fastest, ti.f64))
             if ti.static(self.dim == 2):
                 for i in range(low[0], high[0] + 3):
@@ -392,6 +421,8 @@ class _Kernels:
         """The same, one kernel a substep, all loops parallel (for a GPU)."""
         if keep:
             self.save()
+            if self.has_rigid:
+                self.keep_rigid(False)
         for _ in range(substeps):
             self.substep_parallel(dt, sums)
         self.report_parallel(position, sums)
@@ -404,6 +435,9 @@ class _Kernels:
             for p in range(self.range[m], self.range[m + 1]):
                 base, fx = self.locate(self.x[p])
                 self.p2g(m, p, base, fx, dt)
+        if ti.static(self.has_rigid):
+            for _ in range(1):
+                sums[5] = ti.max(sums[5], ti.cast(self.rigid.step(dt), ti.f64))
         for axis in ti.static(range(self.dim)):
             for I in ti.grouped(self.grid):
                 if I[axis] < 2:
@@ -414,8 +448,9 @@ class _Kernels:
             for I in ti.grouped(self.grid):
                 if I[axis] < 2:
                     self.ghost(axis, I[axis], I, dt, False)
-        for p in range(self.range[ti.static(len(self.models))]):
-            ti.atomic_max(sums[5], ti.cast(self.g2p(p, dt), ti.f64))
+        for m in ti.static(self.flowing):
+            for p in range(self.range[m], self.range[m + 1]):
+                ti.atomic_max(sums[5], ti.cast(self.g2p(p, dt), ti.f64))
         for I in ti.grouped(self.grid):
             self.grid[I] = ti.Vector.zero(ti.f32, 4)
 
@@ -455,6 +490,18 @@ class _Kernels:
                 self.materials[m].reset(p)
         for I in ti.grouped(self.grid):
             self.grid[I] = ti.Vector.zero(ti.f32, 4)
+
+    @ti.kernel
+    def load_rigid(self, table: ti.types.ndarray(ti.f64, 2)):
+        for _ in range(1):
+            self.rigid.load(table)
+            for b in range(self.rigid.count[None]):
+                self.rigid.write(b)
+
+    @ti.kernel
+    def keep_rigid(self, back: ti.template()):
+        for _ in range(1):
+            self.rigid.keep(back)
 
     @ti.kernel
     def load_solids(self, values: ti.types.ndarray(ti.f32, 2)):
@@ -532,6 +579,9 @@ class MPMSimulator:
         position = particles.position
         if self.settings["perturbation"]:
             noise = np.random.default_rng(np.random.SeedSequence([scene.seed, 2])).normal(size=position.shape)
+            for index, body in enumerate(scene.bodies):
+                if scene.materials[body.material].model == "rigid":
+                    noise[particles.body == index] = noise[particles.body == index][:1]
             position = position + self.settings["perturbation"] * noise
         # Where a wall stops particles during the run, it also holds the start.
         cell = np.clip((position - lower) / self.dx + WALL, WALL + HAIR, WALL + cells - HAIR)
@@ -539,12 +589,14 @@ class MPMSimulator:
         kernels.load(data, self._table(scene, particles, cells))
         if structure.obstacles != "none":
             kernels.load_solids(self._solids(scene, nodes))
+        if structure.rigid:
+            kernels.load_rigid(body_table(scene, particles, data[:, : scene.dim].astype(float), self.dx, WALL, structure.rigid[1]))
         self._acceleration, self._frame, self._boundary = scene.acceleration(), 0, scene.boundary.astype(np.float32)
         self._cfl = self.settings["cfl"] or scene.cfl
         self._position = np.zeros((len(position), scene.dim), np.float32)
         self._run(0, 0.0, keep=True)
         if fresh:
-            kernels.restore()
+            self._restore()
             self.compile_seconds += time.perf_counter() - begun
 
     def _table(self, scene: Scene, particles: Particles, cells: np.ndarray) -> np.ndarray:
@@ -591,7 +643,11 @@ class MPMSimulator:
         friction = scene.walls.friction
         walls = "sticky" if friction == "sticky" else "coulomb" if friction > 0 else "slip"
         obstacles = "none" if not scene.obstacles else "slip" if all(kind == 0 for kind in _frictions(scene)) else "coulomb"
-        return Structure(scene.dim, models, walls, obstacles, scene.container is not None)
+        rigid = [body for body in scene.bodies if scene.materials[body.material].model == "rigid"]
+        faces = max((len(body.vertices) if body.vertices else 6 for body in rigid), default=0)
+        # Rounded up, so that scenes of a family share their kernels.
+        limits = (_power_of_two(len(rigid)), 6 if faces <= 6 else 64) if rigid else None
+        return Structure(scene.dim, models, walls, obstacles, scene.container is not None, limits)
 
     def plan(self, scene: Scene) -> dict:
         """What ``load`` would build for a scene, without building it.
@@ -630,6 +686,11 @@ class MPMSimulator:
         if structure.obstacles != "none":
             fields["signed distance"] = (4 * (dim + 2), nodes)
             kernels.append("load_solids")
+        if structure.rigid is None:
+            left_out["rigid bodies"] = "none in the scene"
+        else:
+            fields |= RigidBodies.sizes(dim, *structure.rigid, n)
+            kernels += ["load_rigid", "keep_rigid"]
         speeds = [MODELS[material.model].rest_wave_speed(material, self.settings["stiffness"]) for material in scene.materials.values()]
         gravity = float(np.linalg.norm(np.array(scene.gravity) - scene.acceleration(), axis=1).max())
         start = float(np.sqrt((particles.velocity**2).sum(1).max()))
@@ -660,7 +721,7 @@ class MPMSimulator:
         dt <= cfl dx / (c + |v|) with the current wave speed and the speed that gravity can add within the frame; substeps
         divide the frame exactly. A frame whose Courant number outgrew the plan is taken back and repeated with half the step.
         """
-        kernels, scene, known = self._kernels, self._scene, self._diagnostics
+        scene, known = self._scene, self._diagnostics
         felt = scene.gravity - self._acceleration[min(self._frame, len(self._acceleration) - 1)]
         reach = float(np.linalg.norm(felt)) * scene.frame_step
         substeps = max(1, int(np.ceil(scene.frame_step * (known["wave_speed"] + known["max_speed"] + reach) / (self._cfl * self.dx))))
@@ -673,9 +734,14 @@ class MPMSimulator:
                     self._frame += 1
                     return np.concatenate([self._position[self._tracked], self._boundary])
             if attempt < MAX_HALVINGS:
-                kernels.restore()
+                self._restore()
                 substeps *= 2
         raise SimulationError(f"time step fell below {dt:.3g} s without a finite, stable frame")
+
+    def _restore(self) -> None:
+        self._kernels.restore()
+        if self._kernels.has_rigid:
+            self._kernels.keep_rigid(True)
 
     def diagnostics(self) -> dict[str, float]:
         """Energies [J per unit depth in 2D], max speed and wave speed [m/s], substeps and dt [s] of the current frame."""

@@ -77,7 +77,7 @@ def test_sign_of_a_polygon_that_is_not_convex():
     [
         (SOLIDS[2][4], [0.4, 0.9], 0.1, [0, 1]), (SOLIDS[2][4], [0.3, 0.6], -0.1, [-1, 0]),
         (SOLIDS[2][5], [0.1, 0.5], 0.1, [-1, 0]), (SOLIDS[2][5], [0.45, 0.6], -0.05, [1, 0]), (SOLIDS[2][5], [0.8, 1.3], 0.5, [0.6, 0.8]),
-        (SOLIDS[2][1], [0.6, 0.5], 0.1, [0, 1]), (SOLIDS[2][1], [0.3, 0.8], -0.1, [0, 1]), (SOLIDS[2][1], [0.7, 0.3], -0.1, [0, 1]),
+        (SOLIDS[2][1], [0.6, 0.5], 0.1, [0, 1]), (SOLIDS[2][1], [0.3, 0.8], -0.1, [0, 1]), (SOLIDS[2][1], [0.7, 0.25], -0.05, [0, -1]),
         (SOLIDS[2][3], [-0.3, 0.3], 0.1, [0, 1]), (SOLIDS[2][3], [1.2, 0.2], -0.1, [0, 1]),
         ({"kind": "segment", "start": [0, 0], "end": [1, 0], "thickness": 0.2}, [0.5, -0.3], 0.2, [0, -1]),
         ({"kind": "segment", "start": [0, 0], "end": [1, 0], "thickness": 0.2}, [1.3, 0.4], 0.4, [0.6, 0.8]),
@@ -260,12 +260,13 @@ def test_boundary_particles_cover_the_surface(dim, index):
     assert (found >= 0).all() and (found <= 1).all()
     assert one.distance(found)[0] == pytest.approx(np.full(len(found), -s / 2), abs=2e-3 * s)
     assert cKDTree(found).query(found, 2)[0][:, 1].min() >= 0.9 * s * (1 - 1e-9)
-    # Every place of the surface in the box has a particle near it: half a spacing below and at most one beside.
+    # Every place of the surface in the box has a particle near it: half a spacing below (a diagonal of that at a
+    # corner) and at most the least distance beside, or another particle would have been put there.
     probes = np.random.default_rng(0).uniform(0, 1, (4000, dim))
     distance, normal = one.distance(probes)
     feet = (probes - distance[:, None] * normal)[np.abs(distance) < 4 * s]
     feet = feet[((feet > s) & (feet < 1 - s)).all(1)]
-    assert cKDTree(found).query(feet)[0].max() < 1.4 * s
+    assert cKDTree(found).query(feet)[0].max() < (0.94 + np.sqrt(dim) / 2) * s
     np.testing.assert_array_equal(found, boundary_particles([one], bounds, s))
 
 
@@ -307,8 +308,8 @@ def test_nothing_leaks_through_the_thinnest_plate(wet, speed):
     for _ in range(150):
         last = wet.frame()[:moving].astype(float)
         distance, normal, _ = combine(what.obstacles, last)
-        # On a straight face the field on the grid is exact but for rounding.
-        assert distance.min() > -1e-3 * wet.dx
+        # A straight face is exact between nodes, but for the nodes beyond the plate's middle: 0.04 cells along an axis.
+        assert distance.min() > -0.1 * wet.dx
         assert (last[:, 1] > np.interp(last[:, 0], [-0.2, 1.2], [0.5, 0.4])).all()
     assert distance.min() < wet.dx, "it did reach the plate"
 
@@ -326,7 +327,8 @@ def test_a_plate_works_on_both_faces(wet):
 def test_particles_stay_out_of_curved_and_notched_solids(wet):
     """Between nodes the distance is interpolated: off by dx^2 / 8 r on curves, more at the end of a plate, whose r is 3/4 dx."""
     what = scene([{"kind": "floor", "vertices": [[0, 0.3], [0.3, 0.1], [0.6, 0.35], [1, 0.15]]},
-                  {"kind": "ball", "center": [0.5, 0.5], "radius": 0.1}, {"kind": "segment", "start": [0.1, 0.55], "end": [0.3, 0.5], "thickness": 0.1}])
+                  {"kind": "ball", "center": [0.5, 0.5], "radius": 0.1},
+                  {"kind": "segment", "start": [0.1, 0.55], "end": [0.3, 0.5], "thickness": 0.1}])
     wet.load(what)
     for _ in range(150):
         last = wet.frame()[: len(what.particles().position)].astype(float)

@@ -7,7 +7,8 @@ A material owns the state its particles need and nothing else. It offers Taichi 
 Numbers live in a field, not in the code, so that scenes which differ in numbers share compiled kernels.
 """
 
+from sim.mpm.materials.rigid import RigidModel
 from sim.mpm.materials.sand import SandModel
 from sim.mpm.materials.water import WaterModel
 
-MODELS = {"water": WaterModel, "sand": SandModel}
+MODELS = {"water": WaterModel, "sand": SandModel, "rigid": RigidModel}
