@@ -147,12 +147,15 @@ class RigidBodies:
 
     # -- one substep
     @ti.func
-    def step(self, dt):
-        """From the grid's momenta to the bodies' new places; returns the largest squared speed of a particle. One thread."""
+    def meet(self, dt):
+        """Motion from the grid's momenta, and the contacts that it makes. ``solve`` follows, then ``advance``; all on one thread."""
         for b in range(self.count[None]):
             self.gather(b, dt)
         self.find_contacts(dt)
-        self.solve()
+
+    @ti.func
+    def advance(self, dt):
+        """To the bodies' new places; returns the largest squared speed of a particle."""
         fastest = 0.0
         for b in range(self.count[None]):
             self.move(b, dt)
