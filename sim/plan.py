@@ -71,6 +71,9 @@ def plan_text(family: SceneFamily, jobs: int = 1) -> str:
         f"scene {model.name}: MLS-MPM, {solver['dim']}D, {', '.join(solver['materials'])}, {solver['walls']} walls",
         f"  particles: {found.recorded:.0f} recorded, {found.particles:.0f} simulated (mean of {_SAMPLES} draws); "
         f"{' x '.join(map(str, solver['cells']))} cells of {solver['grid_spacing']:.4g}",
+        *([f"  obstacles: {solver['obstacles']} in the largest draw, {solver['kinematic']} of its recorded particles are kinematic"]
+          if solver["obstacles"] else []),
+        *([f"  context: {solver['context']} numbers a frame"] if solver["context"] else []),
         f"  compiled: {', '.join(solver['kernels'])}",
         f"  allocated: {_size(solver['bytes'])}",
         *(f"    {name}: {entries} x {size} bytes" for name, (size, entries) in solver["fields"].items()),

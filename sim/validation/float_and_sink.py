@@ -1,0 +1,55 @@
+"""Ladder case 16: a rigid box floats with draft / height = rho_b / rho_w, rests on the floor if denser, and stays where it is if neutral."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+
+from sim.mpm.solver import MPMSimulator
+from sim.scene import Scene
+
+WIDTH, HEIGHT, DEPTH = 0.25, 0.125, 0.5
+
+
+def pool_scene(ratio: float, bottom: float, cells: int = 32, sound_speed: float = 15.0) -> Scene:
+    """A pool 1 wide and about 0.5 deep, a box 0.25 x 0.125 of ``ratio`` times water's density in its middle, its lower face at ``bottom``.
+
+    Where the box is, there is no water: the pool is made of the rectangles around it.
+    """
+    left, right, top = 0.5 - WIDTH / 2, 0.5 + WIDTH / 2, bottom + HEIGHT
+    water = [([0.0, 0.0], [left, DEPTH]), ([right, 0.0], [1.0, DEPTH]), ([left, 0.0], [right, min(bottom, DEPTH)]), ([left, top], [right, DEPTH])]
+    bodies = [{"material": "water", "kind": "box", "lower": lower, "upper": upper, "velocity": [0.0, 0.0]}
+              for lower, upper in water if lower[1] < upper[1] - 1e-9]
+    bodies.append({"material": "box", "kind": "box", "lower": [left, bottom], "upper": [right, top], "velocity": [0.0, 0.0]})
+    return Scene.model_validate({
+        "name": "pool", "dim": 2, "bounds": [[0.0, 1.0], [0.0, 1.0]], "gravity": [0.0, -9.8], "frame_step": 0.01, "frames": 300, "radius": 0.1,
+        "cells": [cells, cells], "seed": 0, "bodies": bodies,
+        "materials": {"water": {"model": "water", "sound_speed": sound_speed}, "box": {"model": "rigid", "density": 1000.0 * ratio}},
+    })
+
+
+def float_and_sink(ratio: float, bottom: float, cells: int = 32, seconds: float = 3.0, simulator: MPMSimulator | None = None) -> dict:
+    """Immersed share of the box's height, mean of the last second: ``ratio`` if it floats; the error is the relative difference.
+
+    The surface: mean height of the highest water particle of each cell column further than half a width from the box and the walls, plus
+    half a spacing. ``sunk``: height of the box's lower face over the floor at the end; ``drift``: how far its centre moved from the start.
+    """
+    scene = pool_scene(ratio, bottom, cells)
+    simulator = simulator or MPMSimulator()
+    simulator.load(scene)
+    particles = scene.particles()
+    box, begun, shares = particles.material == 1, time.perf_counter(), []
+    for frame in range(round(seconds / scene.frame_step)):
+        position = simulator.frame().astype(float)
+        if frame * scene.frame_step >= seconds - 1.0:
+            water = position[~box]
+            column = np.floor(water[:, 0] / scene.grid_spacing).astype(int)
+            middle = position[box].mean(0)
+            aside = [c for c in np.unique(column) if abs((c + 0.5) * scene.grid_spacing - middle[0]) > WIDTH and 2 <= c < cells - 2]
+            surface = np.mean([water[column == c, 1].max() for c in aside]) + scene.spacing / 2
+            shares.append((surface - (middle[1] - HEIGHT / 2)) / HEIGHT)
+    ours = float(np.mean(shares))
+    return {"reference": min(ratio, 1.0), "ours": ours, "error": abs(ours / ratio - 1), "seconds": time.perf_counter() - begun,
+            "sunk": float(position[box][:, 1].min() - scene.spacing / 2),
+            "drift": float(np.linalg.norm(position[box].mean(0) - particles.position[box].mean(0)))}  # fmt: skip
