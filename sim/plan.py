@@ -12,8 +12,8 @@ from sim.scene import SceneFamily
 #: Particle-substeps per second of one core, by dimension and the slowest material present: the order of a 2-core cloud machine of
 #: 2023. ``make bench`` measures this machine's.
 RATES = {
-    (2, "water"): 12e6, (2, "sand"): 6e6, (2, "goop"): 6e6, (2, "elastic"): 9e6, (2, "snow"): 4e6,
-    (3, "water"): 4e6, (3, "sand"): 1.5e6, (3, "goop"): 1.5e6, (3, "elastic"): 3e6, (3, "snow"): 1.5e6,
+    (2, "water"): 12e6, (2, "sand"): 6e6, (2, "goop"): 6e6, (2, "elastic"): 9e6, (2, "snow"): 4e6, (2, "rigid"): 12e6,
+    (3, "water"): 4e6, (3, "sand"): 1.5e6, (3, "goop"): 1.5e6, (3, "elastic"): 3e6, (3, "snow"): 1.5e6, (3, "rigid"): 4e6,
 }
 
 #: Scenes drawn to describe a family.
@@ -74,6 +74,9 @@ def plan_text(family: SceneFamily, jobs: int = 1) -> str:
         f"scene {model.name}: MLS-MPM, {solver['dim']}D, {', '.join(solver['materials'])}, {solver['walls']} walls",
         f"  particles: {found.recorded:.0f} recorded, {found.particles:.0f} simulated (mean of {_SAMPLES} draws); "
         f"{' x '.join(map(str, solver['cells']))} cells of {solver['grid_spacing']:.4g}",
+        *([f"  obstacles: {solver['obstacles']} in the largest draw, {solver['kinematic']} of its recorded particles are kinematic"]
+          if solver["obstacles"] else []),
+        *([f"  context: {solver['context']} numbers a frame"] if solver["context"] else []),
         f"  compiled: {', '.join(solver['kernels'])}",
         f"  allocated: {_size(solver['bytes'])}",
         *(f"    {name}: {entries} x {size} bytes" for name, (size, entries) in solver["fields"].items()),

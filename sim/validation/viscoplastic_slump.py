@@ -1,4 +1,4 @@
-"""Viscoplastic slump: a column of Bingham goop slumps on a rough floor and stops where its weight no longer moves it: h^2 = 2 B (x_f - x), B = tau_y / (rho g)."""
+"""Viscoplastic slump: a column of Bingham goop on a rough floor stops where its weight no longer moves it, h^2 = 2 B (x_f - x), B = tau_y / rho g."""
 
 import numpy as np
 

@@ -11,8 +11,11 @@ and ``omissions`` (by the numbers), ``rest_wave_speed``, and ``largest_step``, a
 
 from sim.mpm.materials.elastic import ElasticModel
 from sim.mpm.materials.goop import GoopModel
+from sim.mpm.materials.rigid import RigidModel
 from sim.mpm.materials.sand import SandModel
 from sim.mpm.materials.snow import SnowModel
 from sim.mpm.materials.water import WaterModel
 
-MODELS = {"water": WaterModel, "sand": SandModel, "goop": GoopModel, "elastic": ElasticModel, "snow": SnowModel}
+MODELS = {
+    "water": WaterModel, "sand": SandModel, "goop": GoopModel, "elastic": ElasticModel, "snow": SnowModel, "rigid": RigidModel,
+}
