@@ -24,9 +24,10 @@ def run(resolution: int) -> Outcome:
     for name, pairs in (("slides", SLIDES), ("sticks", STICKS)):
         found = [block_on_plane(*pair, resolution, solver) for pair in pairs]
         seconds += sum(each["seconds"] for each in found)
-        error = max((each["error"] for each in found))
+        error = max(each["error"] for each in found)
+        exact, ours = (np.array([each[key] / G for each in found]) for key in ("reference", "ours"))
         curves[name] = Curve(f"{name}: largest error of the acceleration over g", ("slope [degrees]", "acceleration / g"), np.array(pairs)[:, 0],
-                             np.array([each["reference"] / G for each in found]), np.array([each["ours"] / G for each in found]), error, 0.02)  # fmt: skip
+                             exact, ours, error, 0.02)  # fmt: skip
     return Outcome("block_on_plane", resolution, len(block_scene(20.0, 0.0, resolution).particles().position), curves, seconds)
 
 

@@ -22,7 +22,7 @@ def run(resolution: int) -> Outcome:
     solver = MPMSimulator()
     found = [float_and_sink(ratio, DEPTH - ratio * HEIGHT, resolution, simulator=solver) for ratio in RATIOS]
     neutral = float_and_sink(1.0, 0.1875, resolution, simulator=solver)
-    ours, error = np.array([each["ours"] for each in found]), max((each["error"] for each in found))
+    ours, error = np.array([each["ours"] for each in found]), max(each["error"] for each in found)
     drift = neutral["drift"] / HEIGHT
     curves = {
         "draft": Curve("largest relative error of the draft", ("rho_b / rho_w", "draft / height"), RATIOS, RATIOS, ours, error, 0.05),
