@@ -508,6 +508,10 @@ def _failure(position: np.ndarray) -> int | None:
     return int(np.argmax(lost)) if lost.any() else None
 
 
+def _several_kinds(trajectory: Trajectory) -> bool:
+    return len(np.unique(trajectory.particle_type[trajectory.moving])) > 1
+
+
 def render_trajectory(path: str | Path, trajectory: Trajectory, *, width: int | None = None) -> None:
     """A film (``.mp4``) or a strip of six moments (``.png``) of one trajectory, coloured by speed, or by type where several kinds move.
 
@@ -517,7 +521,7 @@ def render_trajectory(path: str | Path, trajectory: Trajectory, *, width: int | 
         render_strip(path, trajectory, width=width or 300)
         return
     frames = film_frames(len(trajectory.position))
-    if len(np.unique(trajectory.particle_type[trajectory.moving])) > 1:
+    if _several_kinds(trajectory):
         scale = type_scale(trajectory.particle_type)
         value = np.tile(trajectory.particle_type.astype(float), (len(frames), 1))
     else:
@@ -535,7 +539,7 @@ def render_strip(
     path: str | Path, trajectory: Trajectory, times: Sequence[float] | None = None, *,
     predictions: Mapping[str, np.ndarray] | None = None, first: int = 0, name: str = "solver", width: int = 300,
 ) -> None:  # fmt: skip
-    """A film strip: the trajectory at several times [s] side by side (default: six from ``first`` to the end), PNG.
+    """A film strip: the trajectory at several times [s] side by side (default: six from ``first`` to the end), PNG; colours as in a film.
 
     predictions: further rows, name -> [frames, particles, dim], whose frame 0 is the trajectory's frame ``first``. All rows
     share times, camera and speed limits (the trajectory's). Moments that a row lacks, or lost to a failure, are empty boxes.
@@ -543,8 +547,12 @@ def render_strip(
     count, step = len(trajectory.position), trajectory.frame_step
     chosen = np.linspace(first, count - 1, min(6, count - first)) if times is None else np.clip(np.asarray(times, float) / step, 0, count - 1)
     chosen = np.rint(chosen).astype(int)
-    truth = speeds(trajectory.position, chosen, step, trajectory.moving)
-    scale = speed_scale(truth)
+    if _several_kinds(trajectory) and not predictions:
+        truth = np.tile(trajectory.particle_type.astype(float), (len(chosen), 1))
+        scale = type_scale(trajectory.particle_type)
+    else:
+        truth = speeds(trajectory.position, chosen, step, trajectory.moving)
+        scale = speed_scale(truth)
     label = f"{name}, " if predictions else ""
     panes = [Pane(f"{label}t = {k * step:.2f} s", trajectory.position[k][None], value[None], scale) for k, value in zip(chosen, truth, strict=True)]
     nowhere = np.full((1, *trajectory.position.shape[1:]), np.nan, np.float32)
