@@ -42,6 +42,7 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("--jobs", type=_at_least(1), default=1, help="processes, each on one thread (default 1)")
     command.add_argument("--seed", type=_at_least(0), default=0, help="base seed of the data set (default 0)")
     command.add_argument("--shard-size", type=_at_least(1), default=8, help="trajectories in a file (default 8)")
+    command.add_argument("--budget", type=float, default=100.0, metavar="HOURS", help="refuse what is estimated to need more hours of one core (default 100)")
 
     command = commands.add_parser("plan", help="what a scene compiles and allocates, what it leaves out, memory and time; runs nothing")
     command.set_defaults(run=_plan)
@@ -77,6 +78,7 @@ def _family(options: argparse.Namespace):
 
 def _generate(options: argparse.Namespace) -> int:
     from sim.generate import SPLITS, generate
+    from sim.plan import check_budget
 
     family = _family(options)
     if options.count is not None and options.split is None:
@@ -85,6 +87,7 @@ def _generate(options: argparse.Namespace) -> int:
     if options.count is not None:
         counts[options.split] = options.count
     counts = {split: count for split, count in counts.items() if count}
+    check_budget(family, sum(counts.values()), options.budget)
     content = generate(family, counts, options.out, jobs=options.jobs, seed=options.seed, shard_size=options.shard_size)
     for split in counts:
         entry = content["splits"][split]

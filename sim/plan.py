@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sim.errors import InputError
 from sim.generate import SPLITS, trajectory_seed
 from sim.scene import SceneFamily
 
@@ -50,6 +51,22 @@ def plan(family: SceneFamily) -> Plan:
         solver=max(plans, key=lambda each: each["bytes"]), recorded=recorded, particles=particles, substeps=(round(substeps[0]), round(substeps[1])),
         particle_substeps=work, rate=rate, seconds=work / rate, disk=4.0 * model.frames * recorded * model.dim,
     )
+
+
+def check_budget(family: SceneFamily, trajectories: int, budget: float) -> None:
+    """Refuse what is estimated to need more than ``budget`` hours of one core: stiff scenes are easily asked for and never finished.
+
+    Raises ``InputError`` with the estimate and what makes it.
+    """
+    found = plan(family)
+    hours = trajectories * found.seconds / 3600
+    if hours > budget:
+        remedy = (
+            f"{trajectories} trajectories x {found.particles:.0f} particles x {family.model.frames - 1} frames x "
+            f"{found.substeps[0]} to {found.substeps[1]} substeps (wave speed {found.solver['wave_speed']:.3g} m/s) need about {hours:.3g} hours of one "
+            f"core, more than the budget of {budget:g}; soften the material, ask for fewer, or raise --budget"
+        )
+        raise InputError(family.where, "--budget", budget, remedy)
 
 
 def _duration(seconds: float) -> str:
