@@ -500,7 +500,7 @@ class _Progress:
 
 
 @dataclass
-class _Moments:
+class Moments:
     """Streaming sums over rows [n, dim] in float64. Means are small against deviations here, so plain sums of squares do."""
 
     count: int = 0
@@ -509,9 +509,9 @@ class _Moments:
 
     def add(self, rows: np.ndarray) -> None:
         rows = rows.reshape(-1, rows.shape[-1])
-        self.merge(_Moments(len(rows), rows.sum(0), np.einsum("ij,ij->j", rows, rows)))
+        self.merge(Moments(len(rows), rows.sum(0), np.einsum("ij,ij->j", rows, rows)))
 
-    def merge(self, other: _Moments) -> None:
+    def merge(self, other: Moments) -> None:
         self.count += other.count
         self.total = self.total + other.total
         self.squares = self.squares + other.squares
@@ -526,8 +526,8 @@ class _Moments:
 
 @dataclass
 class _ShardStatistics:
-    velocity: _Moments = field(default_factory=_Moments)
-    acceleration: _Moments = field(default_factory=_Moments)
+    velocity: Moments = field(default_factory=Moments)
+    acceleration: Moments = field(default_factory=Moments)
     particles: list[int] = field(default_factory=list)
     frames: list[int] = field(default_factory=list)
     neighbours: list[float] = field(default_factory=list)
@@ -567,7 +567,7 @@ def training_statistics(shards: list[Path], jobs: int = 1) -> dict | None:
     stride = max(1, (max(indices) + 1) // _NEIGHBOUR_TRAJECTORIES)
     if not any(index % stride == 0 for index in indices):
         stride = 1
-    velocity, acceleration = _Moments(), _Moments()
+    velocity, acceleration = Moments(), Moments()
     particles: list[int] = []
     frames: list[int] = []
     neighbours: list[float] = []
