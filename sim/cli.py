@@ -150,7 +150,7 @@ def _export(options: argparse.Namespace) -> int:
     for split, index, status in done.failed:
         print(f"left out: {split} {index:06d}: {status}")
     counts = ", ".join(f"{split or 'shard'} {count}" for split, count in done.trajectories.items())
-    print(f"{options.out}: trajectories as {options.format}: {counts}; {len(done.failed)} failed ones left out")
+    print(f"{options.out}: trajectories as {options.format}: {counts}; {len(done.failed)} failed left out")
     return 0
 
 

@@ -28,7 +28,7 @@ import pickle
 import shutil
 import struct
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -52,6 +52,8 @@ _TYPE_SLOTS = 9
 _LAGRANGEBENCH_TYPES = {0: 3, 3: 1}
 #: A protobuf message of 2 GiB cannot be parsed; the rest of a record is far below a MiB.
 _MESSAGE_LIMIT = 2**31 - 2**20
+#: Rows of a VTKHDF file that are written at once: some MiB, so that time goes into the disk and not into calls.
+_BLOCK = 2**18
 
 
 @dataclass
@@ -133,15 +135,17 @@ def _new_folder(path: Path) -> Iterator[Path]:
 
 
 def _slice(text: str) -> slice:
-    """``"start:stop:step"`` (each part optional) or one frame number."""
+    """``"start:stop:step"`` (each part optional, forwards only: time runs so) or one frame number."""
     try:
         parts = [int(part) if part.strip() else None for part in text.split(":")]
         if len(parts) == 1:
             return slice(parts[0], parts[0] + 1 or None)
-        slice(*parts).indices(1)  # a step of zero
-        return slice(*parts)
+        chosen = slice(*parts)
+        if chosen.step is None or chosen.step > 0:
+            return chosen
     except (TypeError, ValueError):
-        raise InputError("sluice-sim export", "frames", text, "give start:stop:step, each part optional, or one frame number") from None
+        pass
+    raise InputError("sluice-sim export", "frames", text, "give start:stop:step, each part optional, step above 0, or one frame number")
 
 
 # --- what there is to export -----------------------------------------------------------------------------------------
@@ -227,50 +231,54 @@ def _write_for_viewers(stem: Path, format: str, reader: ShardReader, number: int
         _write_frames(stem, format, position, kinds, step, frames)
 
 
-def _in_space(row: np.ndarray) -> np.ndarray:
-    """[particles, dim] to [particles, 3]: z = 0 in 2D."""
-    return np.pad(row, ((0, 0), (0, 3 - row.shape[1])))
+def _in_space(rows: np.ndarray) -> np.ndarray:
+    """[..., dim] to [..., 3]: z = 0 in 2D."""
+    return np.concatenate([rows, np.zeros((*rows.shape[:-1], 3 - rows.shape[-1]), rows.dtype)], axis=-1)
 
 
-def velocity(position: np.ndarray, frame: int, frame_step: float) -> np.ndarray:
-    """[particles, dim] float32 [length / s] at ``frame`` of ``position`` [frames, particles, dim]: backward difference, forward at frame 0."""
+def velocities(position: np.ndarray, frames: Sequence[int], frame_step: float) -> np.ndarray:
+    """[len(frames), particles, dim] float32 [length / s] of ``position`` [frames, particles, dim]: backward differences, forward at frame 0."""
     if len(position) < 2:
-        return np.zeros_like(position[0])
-    later = max(frame, 1)
+        return np.zeros((len(frames), *position.shape[1:]), np.float32)
+    later = np.maximum(frames, 1)
     return ((position[later].astype(np.float64) - position[later - 1]) / frame_step).astype(np.float32)
 
 
 def _write_vtkhdf(path: Path, position: np.ndarray, kinds: np.ndarray, frame_step: float, frames: range) -> None:
-    """A transient PolyData of vertices: points and velocities of all steps one after another, types and vertices once for all of them.
+    """A transient PolyData of vertices: points and velocities of all steps one after another, all else once.
 
-    Offsets say where a step begins in each array; for what does not change they are zero (VTKHDF 2.0, "Temporal data").
+    Offsets say where a step begins in each array (VTKHDF 2.0, "Temporal data"); zero where steps share it. They share even the one
+    part: VTK 9.3 (ParaView 5.12) cannot read vertices that several parts share.
     """
     count, particles = len(frames), position.shape[1]
-    starts = np.arange(count, dtype=np.int64) * particles
-    same = np.zeros(count, np.int64)
+    moving, shared = np.arange(count) * particles, np.zeros(count, np.int64)
     with _hdf5(path) as (file, disk):
         root = file.create_group("VTKHDF")
         root.attrs["Version"] = np.array([2, 0], np.int64)
         root.attrs["Type"] = np.bytes_("PolyData")  # VTK reads ASCII of fixed length only
-        root["NumberOfPoints"] = np.full(count, particles, np.int64)
+        arrays = {"NumberOfPoints": np.array([particles]), "PointData/particle_type": kinds}
         for name in ("Vertices", "Lines", "Polygons", "Strips"):
             cells = particles if name == "Vertices" else 0
-            root[f"{name}/NumberOfCells"] = root[f"{name}/NumberOfConnectivityIds"] = np.full(count, cells, np.int64)
-            root[f"{name}/Offsets"] = np.arange(cells + 1, dtype=np.int64)
-            root[f"{name}/Connectivity"] = np.arange(cells, dtype=np.int64)
-        steps = root.create_group("Steps")
-        steps.attrs["NSteps"] = np.int64(count)
-        steps["Values"] = np.array([frame * frame_step for frame in frames])
-        steps["PartOffsets"], steps["NumberOfParts"] = np.arange(count, dtype=np.int64), np.ones(count, np.int64)
-        steps["PointOffsets"] = steps["PointDataOffsets/velocity"] = starts
-        steps["PointDataOffsets/particle_type"] = same
-        steps["CellOffsets"] = steps["ConnectivityIdOffsets"] = np.zeros((count, 4), np.int64)
-        root["PointData/particle_type"] = kinds
+            arrays |= {f"{name}/NumberOfCells": np.array([cells]), f"{name}/NumberOfConnectivityIds": np.array([cells])}
+            arrays |= {f"{name}/Offsets": np.arange(cells + 1), f"{name}/Connectivity": np.arange(cells)}
+        root.create_group("Steps").attrs["NSteps"] = count
+        arrays |= {
+            "Steps/Values": np.array([frame * frame_step for frame in frames]),
+            "Steps/PartOffsets": shared, "Steps/NumberOfParts": np.ones(count, np.int64),
+            "Steps/PointOffsets": moving, "Steps/PointDataOffsets/velocity": moving, "Steps/PointDataOffsets/particle_type": shared,
+            "Steps/CellOffsets": np.zeros((count, 4), np.int64), "Steps/ConnectivityIdOffsets": np.zeros((count, 4), np.int64),
+        }
+        for name, array in arrays.items():
+            # Not ``root[name] = array``: HDF5 would write the time of day into groups on the way.
+            root.create_dataset(name, data=array)
         points = root.create_dataset("Points", (count * particles, 3), np.float32)
-        velocities = root.create_dataset("PointData/velocity", (count * particles, 3), np.float32)
-        for start, frame in zip(starts, frames, strict=True):
-            points[start : start + particles] = _in_space(position[frame])
-            velocities[start : start + particles] = _in_space(velocity(position, frame, frame_step))
+        speeds = root.create_dataset("PointData/velocity", (count * particles, 3), np.float32)
+        block = max(1, _BLOCK // max(particles, 1))
+        for first in range(0, count, block):
+            some = frames[first : first + block]
+            rows = slice(first * particles, (first + len(some)) * particles)
+            points[rows] = _in_space(position[some]).reshape(-1, 3)
+            speeds[rows] = _in_space(velocities(position, some, frame_step)).reshape(-1, 3)
             disk.check()
 
 
@@ -280,7 +288,7 @@ def _write_frames(folder: Path, format: str, position: np.ndarray, kinds: np.nda
 
     vertices = [] if format == "ply" else [("vertex", np.arange(len(kinds))[:, None])]
     for frame in frames:
-        speed = _in_space(velocity(position, frame, frame_step))
+        speed = _in_space(velocities(position, [frame], frame_step)[0])
         data = dict(zip(("velocity_x", "velocity_y", "velocity_z"), speed.T, strict=True)) if format == "ply" else {"velocity": speed}
         mesh = meshio.Mesh(_in_space(position[frame]), vertices, point_data={"particle_type": kinds} | data)
         mesh.write(folder / f"frame-{frame:05d}.{format}", file_format=format)
@@ -506,8 +514,8 @@ def _write_lagrangebench(path: Path, trajectories: _Split) -> None:
     with _hdf5(path) as (file, disk):
         for number, (position, kinds, _) in enumerate(trajectories):
             group = file.create_group(f"{number:05d}")
-            group["position"] = position
-            group["particle_type"] = np.array([_LAGRANGEBENCH_TYPES.get(kind, kind) for kind in kinds.tolist()], np.int32)
+            group.create_dataset("position", data=position)
+            group.create_dataset("particle_type", data=[_LAGRANGEBENCH_TYPES.get(kind, kind) for kind in kinds.tolist()], dtype=np.int32)
             disk.check()
 
 
@@ -522,21 +530,30 @@ _LEARNERS: dict[str, tuple[str, Callable[[Path, _Split], None]]] = {
 
 
 class _Disk(io.FileIO):
-    """A file for HDF5 to write to, which on a full disk ends the process with a segmentation fault: a failed write is kept for ``check``."""
+    """A file for HDF5 to write to. What goes wrong below HDF5 (a full disk, Ctrl-C) would end the process with a segmentation fault;
+    here it is kept for ``check``, and nothing more is written.
+    """
 
-    error: OSError | None = None
+    error: BaseException | None = None
 
     def write(self, data: memoryview) -> int:
-        rest = memoryview(data).cast("B")
         try:
+            rest = memoryview(data).cast("B")
             while self.error is None and rest:
                 rest = rest[super().write(rest) :]
-        except OSError as error:
+        except BaseException as error:
             self.error = error
         return len(data)
 
+    def truncate(self, size: int | None = None) -> int:
+        try:
+            return super().truncate(size)
+        except BaseException as error:
+            self.error = self.error or error
+            return size
+
     def check(self) -> None:
-        """Raise what a write has failed with."""
+        """Raise what went wrong."""
         if self.error is not None:
             raise self.error
 
