@@ -15,8 +15,8 @@ export. Layouts are taken from what reads them: VTK's specification and ``vtkHDF
 ``learning_to_simulate/reading_utils.py`` and the message definitions of TensorFlow (``example.proto``, ``feature.proto``);
 ``lagrangebench/data/data.py`` and that project's own converter of DeepMind's data (``tfrecord_to_h5.py``).
 
-Decision: the folder is made under a temporary name and renamed at the end, so that an export is complete or absent; at any time
-one trajectory is in memory.
+Decision: the folder is made under a temporary name and renamed at the end, so that an export is complete or absent. Trajectories
+pass one by one; memory is a few times the largest.
 """
 
 from __future__ import annotations
@@ -85,7 +85,11 @@ def export(
     if format not in FORMATS:
         raise InputError("sluice-sim export", "format", format, f"give one of {', '.join(FORMATS)}")
     out = Path(os.path.abspath(out))
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+    try:
+        taken = out.exists() and (not out.is_dir() or any(out.iterdir()))
+    except OSError as error:
+        raise InputError(out, "out", str(out), f"cannot be looked into ({error.strerror}); give another folder") from None
+    if taken:
         raise InputError(out, "out", str(out), "exists already; give a new folder")
     viewer = format in VIEWER_FORMATS
     for key, value in {"index": index, "frames": frames}.items():
@@ -109,7 +113,7 @@ def export(
                     write(folder / f"{name}{suffix}", _Split(found, name))
                 write_json(folder / "metadata.json", metadata)
     except OSError as error:
-        raise RunError(f"{out}: cannot be written: {os.strerror(error.errno) if error.errno else error}") from None
+        raise RunError(f"{out}: cannot be written: {error.strerror or ' '.join(str(error).split())}") from None
     return exported
 
 
@@ -120,7 +124,7 @@ def _new_folder(path: Path) -> Iterator[Path]:
     try:
         temporary.mkdir(parents=True)
     except OSError as error:
-        raise InputError(path, "out", str(path), f"cannot be written ({os.strerror(error.errno or 0)}); give another folder") from None
+        raise InputError(path, "out", str(path), f"cannot be written ({error.strerror}); give another folder") from None
     try:
         yield temporary
         for file in temporary.rglob("*"):
@@ -158,13 +162,12 @@ def _source(path: Path, split: str | None) -> _Source:
         return _Source(path, None, {"": [path]})
     content = read_content(path)
     splits = content["splits"]
-    if split is not None and split not in splits:
-        raise InputError(path / "dataset.json", "split", split, f"the data set holds {', '.join(splits) or 'no finished split'}")
-    names = [name for name in (*SPLITS, *(splits.keys() - set(SPLITS))) if name in splits and split in (None, name)]
-    if not names:
-        raise InputError(path / "dataset.json", "splits", splits, "no split is finished; generate one")
+    finished = [name for name in SPLITS if name in splits]
+    if not finished or split not in (None, *finished):
+        remedy = f"the data set holds {', '.join(finished) or 'no finished split'}; generate what is missing"
+        raise InputError(path / "dataset.json", "split", split, remedy)
     shards = {}
-    for name in names:
+    for name in [split] if split else finished:
         try:
             shards[name] = [path / shard for shard in splits[name]["shards"]]
             int(splits[name]["ok"]), [(int(failure["index"]), str(failure["status"])) for failure in splits[name]["failed"]]
@@ -565,7 +568,7 @@ def _hdf5(path: Path) -> Iterator[tuple[h5py.File, _Disk]]:
         try:
             with h5py.File(disk, "w", libver=("v108", "v110")) as file:
                 yield file, disk
-        except RuntimeError:
-            disk.check()
+        except (OSError, RuntimeError):
+            disk.check()  # the cause, where there is one
             raise
         disk.check()
