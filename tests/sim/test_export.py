@@ -221,6 +221,13 @@ def test_vtk_reads_the_vtu_frames_as_vertices(data, tmp_path):
     same_bits(np.asarray(grid.point_data["velocity"]), padded(velocities(run[0], [3], 0.0025)[0]))
 
 
+def test_a_long_trajectory_is_written_in_blocks(data, tmp_path, monkeypatch):
+    export(data, tmp_path / "whole", "vtkhdf", split="test")
+    monkeypatch.setattr(sim.export, "_BLOCK", 3 * given_by(data, "test")[0][0].shape[1])  # eight frames: 3 + 3 + 2
+    export(data, tmp_path / "blocks", "vtkhdf", split="test")
+    assert (tmp_path / "blocks/test/000000.vtkhdf").read_bytes() == (tmp_path / "whole/test/000000.vtkhdf").read_bytes()
+
+
 @pytest.mark.parametrize("name", ["vtkhdf", *LEARNER_FORMATS])
 def test_same_bytes_twice(data, tmp_path, name):
     export(data, tmp_path / "a", name)
@@ -261,7 +268,8 @@ def test_metadata_by_hand(tmp_path):
     """x = 0, 1, 3: velocities 1 and 2 a frame, acceleration 1; an obstacle that moves does not count; no split but training does."""
     position = np.zeros((3, 2, 2))
     position[:, 0, 0], position[:, 1, 1] = [0, 1, 3], [0, 5, 50]
-    made = {"train": {0: trajectory(position, [5, 3])}, "test": {0: trajectory(100 * position, [5, 3])}}
+    wall = np.zeros((3, 1, 2))
+    made = {"train": {0: trajectory(np.concatenate([position, wall], axis=1), [5, 3, 3])}, "test": {0: trajectory(100 * position, [5, 3])}}
     data = write_data(tmp_path / "data", made)
     common = {
         "bounds": [[0.1, 0.9], [0.1, 0.9]], "default_connectivity_radius": 0.1, "dim": 2, "dt": 0.0025,
@@ -271,7 +279,7 @@ def test_metadata_by_hand(tmp_path):
         "geoelements": {"sequence_length": 3}, "deepmind": {"sequence_length": 2},
         "lagrangebench": {
             "sequence_length": 3, "sequence_length_train": 3, "sequence_length_test": 3, "num_trajs_train": 1, "num_trajs_test": 1, "dx": 0.05,
-            "write_every": 1, "num_particles_max": 2, "periodic_boundary_conditions": [False, False, False],
+            "write_every": 1, "num_particles_max": 3, "periodic_boundary_conditions": [False, False, False],
         },
     }
     for name, special in additions.items():
@@ -347,13 +355,6 @@ def test_npz_names_public_numpy_only(data, tmp_path):
             position, kinds = Strict(entry).load()
     same_bits(position, given_by(data, "train")[1][0])
     position += 1  # its own memory, as what NumPy wrote would have
-
-
-def test_an_archive_survives_as_many_frames_as_particles(tmp_path):
-    """Arrays whose first axes agree tempt NumPy to make one array of both."""
-    data = write_data(tmp_path / "data", {"train": {0: trajectory(np.random.default_rng(0).random((4, 4, 2)))}})
-    export(data, tmp_path / "out", "geoelements")
-    assert read_geoelements(tmp_path / "out", "train")[0][0].shape == (4, 4, 2)
 
 
 def test_lagrangebench_keeps_obstacles_still(tmp_path):
@@ -514,6 +515,12 @@ def test_damage_met_half_way_leaves_nothing(data, tmp_path, monkeypatch, name):
     assert [path.name for path in tmp_path.iterdir()] == ["data"]
 
 
+def assert_runs(code, *arguments):
+    environment = os.environ | {"PYTHONPATH": str(HERE.parents[1])}
+    done = subprocess.run([sys.executable, "-c", code, *map(str, arguments)], env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
 def test_a_full_disk_is_a_run_error_and_leaves_nothing(tmp_path):
     """Real failing writes, in a process of its own: a limit on file sizes. HDF5 would end the process with a segmentation fault."""
     write_data(tmp_path / "data", {"train": {index: some(index, 300) for index in range(12)}}, shard_size=12)
@@ -525,11 +532,19 @@ def test_a_full_disk_is_a_run_error_and_leaves_nothing(tmp_path):
         "    except RunError as error:\n        assert 'cannot be written: File too large' in str(error), error\n"
         "    else:\n        sys.exit(f'{name} was written')\n"
     )
-    environment = os.environ | {"PYTHONPATH": str(HERE.parents[1])}
-    arguments = [sys.executable, "-c", code, str(tmp_path / "data"), str(tmp_path / "out")]
-    done = subprocess.run(arguments, env=environment, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+    assert_runs(code, tmp_path / "data", tmp_path / "out")
     assert os.listdir(tmp_path) == ["data"]
+
+
+def test_writes_that_fail_late_or_in_part_are_noticed(tmp_path):
+    """A write that takes less than it was given; what HDF5 writes only when it closes the file."""
+    code = (
+        "import resource, sys\nfrom sim.export import _Disk, _hdf5\nresource.setrlimit(resource.RLIMIT_FSIZE, (5, resource.RLIM_INFINITY))\n"
+        "disk = _Disk(sys.argv[1], 'w+')\ndisk.write(b'ten bytes.')\n"
+        "try:\n    disk.check()\nexcept OSError:\n    pass\nelse:\n    sys.exit('in part')\n"
+        "try:\n    with _hdf5(sys.argv[1]) as (file, disk):\n        file.create_group('a')\nexcept OSError:\n    pass\nelse:\n    sys.exit('late')\n"
+    )
+    assert_runs(code, tmp_path / "a.h5")
 
 
 def test_a_failed_flush_leaves_nothing(data, tmp_path, monkeypatch):
