@@ -64,6 +64,15 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("shard", type=Path)
     command.add_argument("--index", type=_at_least(0), help="trajectory index (default: the shard's first)")
     command.add_argument("--out", type=Path, required=True, help="the picture's file")
+
+    command = commands.add_parser("export", help="trajectories in the formats of viewers (ParaView, ...) and of other learners")
+    command.set_defaults(run=_export)
+    command.add_argument("source", type=Path, help="a data set folder or, for viewers, a shard")
+    command.add_argument("--format", choices=("vtkhdf", "ply", "vtu", "geoelements", "deepmind", "lagrangebench"), required=True)
+    command.add_argument("--out", type=Path, required=True, help="a new folder")
+    command.add_argument("--split", choices=("train", "valid", "test"), help="export this split (default: all)")
+    command.add_argument("--index", type=_at_least(0), help="viewers: only the trajectory with this index")
+    command.add_argument("--frames", metavar="START:STOP:STEP", help="viewers: only these frames; each part is optional, --frames=-1 is the last one")
     return parser
 
 
@@ -136,6 +145,17 @@ def _render(options: argparse.Namespace) -> int:
     from sim.render import render_trajectory
 
     render_trajectory(options.out, trajectory)
+    return 0
+
+
+def _export(options: argparse.Namespace) -> int:
+    from sim.export import export
+
+    done = export(options.source, options.out, options.format, split=options.split, index=options.index, frames=options.frames)
+    for split, index, status in done.failed:
+        print(f"left out: {split} {index:06d}: {status}")
+    counts = ", ".join(f"{split or 'shard'} {count}" for split, count in done.trajectories.items())
+    print(f"{options.out}: trajectories as {options.format}: {counts}; {len(done.failed)} failed left out")
     return 0
 
 
