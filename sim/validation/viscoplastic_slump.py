@@ -7,16 +7,17 @@ from sim.validation import Curve, Outcome, scene, timed
 
 #: Cells along a unit of length.
 RESOLUTIONS = (40, 60, 80)
-RHO, G, YIELD, ETA, E, NU = 1000.0, 9.8, 184.0, 20.0, 1e5, 0.4
-HALF, HEIGHT, BOX = 0.25, 0.24, (0.8, 0.4)
-SECONDS, FRAME = 4.0, 0.05
+RHO, G, YIELD, ETA, E, NU = 1000.0, 9.8, 73.5, 20.0, 3e4, 0.4
+HALF, HEIGHT, BOX = 0.6, 0.25, (1.8, 0.4)
+SECONDS, FRAME = 6.0, 0.05
 
 
 def slump(resolution: int, yield_stress: float = YIELD) -> tuple[np.ndarray, np.ndarray, np.ndarray, int, float]:
     """Run to the end: x of the cells, height there at the start and at the end (mass over density), particles, wall seconds."""
     cells = [round(2 * BOX[0] * resolution), round(BOX[1] * resolution)]
     what = scene(
-        "viscoplastic-slump", {"model": "goop", "density": RHO, "young_modulus": E, "poisson_ratio": NU, "yield_stress": yield_stress, "viscosity": ETA},
+        "viscoplastic-slump",
+        {"model": "goop", "density": RHO, "young_modulus": E, "poisson_ratio": NU, "yield_stress": yield_stress, "viscosity": ETA},
         [{"kind": "box", "lower": [-HALF, 0.0], "upper": [HALF, HEIGHT]}], [[-BOX[0], BOX[0]], [0.0, BOX[1]]], cells, FRAME,
         gravity=[0.0, -G], walls={"friction": "sticky"},
     )  # fmt: skip
