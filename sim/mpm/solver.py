@@ -552,8 +552,8 @@ class MPMSimulator:
         """Advance one frame; positions of the recorded particles, [n, dim] float32. Raises ``SimulationError``.
 
         dt <= cfl dx / (c + |v|) with the current wave speed and the speed that gravity can add within the frame, and the bounds of a
-        lone particle and of the materials (viscosity); substeps divide the frame exactly. A frame whose Courant number outgrew the plan is taken back and
-        repeated with half the step.
+        lone particle and of the materials (viscosity); substeps divide the frame exactly. A frame whose Courant number outgrew the
+        plan is taken back and repeated with half the step.
         """
         kernels, scene, known = self._kernels, self._scene, self._diagnostics
         reach = float(np.linalg.norm(scene.gravity)) * scene.frame_step
