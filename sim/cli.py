@@ -42,7 +42,8 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("--jobs", type=_at_least(1), default=1, help="processes, each on one thread (default 1)")
     command.add_argument("--seed", type=_at_least(0), default=0, help="base seed of the data set (default 0)")
     command.add_argument("--shard-size", type=_at_least(1), default=8, help="trajectories in a file (default 8)")
-    command.add_argument("--budget", type=float, default=100.0, metavar="HOURS", help="refuse what is estimated to need more hours of one core (default 100)")
+    help_ = "refuse what is estimated to need more hours of one core (default 100)"
+    command.add_argument("--budget", type=float, default=100.0, metavar="HOURS", help=help_)
 
     command = commands.add_parser("plan", help="what a scene compiles and allocates, what it leaves out, memory and time; runs nothing")
     command.set_defaults(run=_plan)

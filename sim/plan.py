@@ -63,8 +63,8 @@ def check_budget(family: SceneFamily, trajectories: int, budget: float) -> None:
     if hours > budget:
         remedy = (
             f"{trajectories} trajectories x {found.particles:.0f} particles x {family.model.frames - 1} frames x "
-            f"{found.substeps[0]} to {found.substeps[1]} substeps (wave speed {found.solver['wave_speed']:.3g} m/s) need about {hours:.3g} hours of one "
-            f"core, more than the budget of {budget:g}; soften the material, ask for fewer, or raise --budget"
+            f"{found.substeps[0]} to {found.substeps[1]} substeps (wave speed {found.solver['wave_speed']:.3g} m/s) need about {hours:.3g} hours "
+            f"of one core, more than the budget of {budget:g}; soften the material, ask for fewer, or raise --budget"
         )
         raise InputError(family.where, "--budget", budget, remedy)
 

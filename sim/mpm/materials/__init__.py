@@ -6,7 +6,7 @@ A material owns the state its particles need and nothing else. It offers Taichi 
 ``intact(p)`` says that the state is finite and its volume positive.
 Numbers live in a field, not in the code, so that scenes which differ in numbers share compiled kernels.
 On the host it says what it is: ``state``, ``fields``, ``numbers``, ``options`` (what is compiled in), ``left_out`` (by the model)
-and ``omissions`` (by the numbers), ``rest_wave_speed``, and ``largest_step``, a bound on dt beside the Courant number's.
+and ``omissions`` (by the numbers), ``rest_wave_speed``, and two bounds on dt beside the Courant number's: ``largest_step``, ``rings``.
 """
 
 from sim.mpm.materials.elastic import ElasticModel

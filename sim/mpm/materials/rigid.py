@@ -34,6 +34,11 @@ class RigidModel:
         return {}
 
     @staticmethod
+    def rings(material) -> bool:
+        """Whether a particle alone on the grid resists both ways, and so is an oscillator."""
+        return False
+
+    @staticmethod
     def largest_step(material, dim: int, dx: float) -> float:
         """No bound on the time step beside the Courant number's."""
         return float("inf")

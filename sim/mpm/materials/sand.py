@@ -35,6 +35,11 @@ class SandModel(Principal):
     def omissions(material) -> dict[str, str]:
         return {} if material.cohesion else {"cohesion": "zero: the cone's tip is at the origin"}
 
+    @staticmethod
+    def rings(material) -> bool:
+        """Without cohesion it does not: stretched, sand is slack."""
+        return material.cohesion > 0
+
     def fields(self) -> list:
         return [self.b, self.v]
 

@@ -68,6 +68,11 @@ class LeftCauchyGreen:
         return float(np.sqrt((lam + 2 * mu) / material.density))
 
     @staticmethod
+    def rings(material) -> bool:
+        """Whether a particle alone on the grid resists both ways, and so is an oscillator."""
+        return True
+
+    @staticmethod
     def largest_step(material, dim: int, dx: float) -> float:
         """No bound on the time step beside the Courant number's."""
         return np.inf

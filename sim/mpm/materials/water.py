@@ -42,6 +42,11 @@ class WaterModel:
         return material.sound_speed * float(np.sqrt(stiffness))
 
     @staticmethod
+    def rings(material) -> bool:
+        """Whether a particle alone on the grid resists both ways, and so is an oscillator."""
+        return True
+
+    @staticmethod
     def largest_step(material, dim: int, dx: float) -> float:
         """dt <= dx^2 rho0 / (2 d eta), explicit diffusion of momentum."""
         return dx * dx * material.density / (2 * dim * material.viscosity) if material.viscosity else np.inf
