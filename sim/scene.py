@@ -428,7 +428,7 @@ class SceneFamily:
         for (name, key), spread in self.spreads.items():
             for value in {end for ranges in spread.values() for ends in ranges for end in ends}:
                 self._validated(_merged(content, {"materials": {name: {key: value}}}))
-        folder = where.parent if isinstance(where, Path) else Path()
+        folder = Path(str(where)).parent
         self._meshes = {index: obstacle.read(folder, where, f"obstacles[{index}]")
                         for index, obstacle in enumerate(self.model.obstacles) if obstacle.kind == "mesh"}
 

@@ -1,14 +1,17 @@
 """Rigid bodies among the particles of the grid: exact shape, two-way coupling, contacts by impulses.
 
-A body gives its particles' mass and momentum to the grid (v = V + w x r, C = [w]x, no stress). From the grid, before walls and
-obstacles act on it, it takes back the linear and angular momentum that its particles would gather,
+A body gives its particles' mass and momentum to the grid (v = V + w x r, C = [w]x, no stress). Nodes that it fills to ``SOLID`` or
+more (``share``) are the body's: whatever else gave them mass moves with it. Before walls and obstacles act on the grid, each body takes
+the rigid motion nearest to its nodes' velocities,
 
-    P = sum_p sum_i w_ip m v_i,    L = sum_p sum_i w_ip m (x_i - c) x v_i,    V = P / M,    w = I^-1 L,
-    I = sum_p m (|r|^2 1 - r r^T) + sum_p m (moment of a quadratic B-spline: dx^2 / 4 along each axis),
+    minimise sum_i mu_i |A + w x (x_i - c) - v_i|^2,  mu_i = sum_p w_ip m (times the node's mass over the rigid mass there, if it is filled),
 
-so momenta are conserved (the spline's own moment belongs to the inertia: a rigid rotation goes through the grid unchanged), and
-since this is a least-squares fit of a rigid motion, energy can only fall. c and the rotation (a quaternion) then move the particles,
-whose places in the body never change. Two and three dimensions share the code: a 2D body is a 3D one that turns about z.
+and filled nodes get that motion. Linear and angular momentum are what they were, exactly (the normal equations), and energy can only
+fall (a projection). Were filled nodes left to themselves, nothing would hold the water out: each substep a node takes up the
+pressure's push, the body averages it away, and water flows in at about g dt H / dx, ten times too deep a draft. c and the rotation
+(a quaternion) then move the particles, whose places in the body never change. The moment of inertia of a lone body is
+I = sum_p m (|r|^2 1 - r r^T) and that of the quadratic B-splines, dx^2 / 4 along each axis. Two and three dimensions share the
+code: a 2D body is a 3D one that turns about z.
 
 Decision: walls, obstacles and other bodies act on the *body*, not on its share of the grid. On the grid only the nodes behind a wall
 would be held, a tenth of a body's mass; each substep it would regain the weight that they took off, and creep down any slope
@@ -32,6 +35,8 @@ SWEEPS, SETTLED = 60, 1e-4
 NEAR = 0.1
 #: Friction coefficient of sticky walls and obstacles.
 NO_SLIP = 1e9
+#: Nodes filled by bodies to this share of a cell are theirs: 1/2 is a body's face.
+SOLID = 0.5 - 1e-3
 #: Columns of the table that ``load`` takes, before the planes.
 COLUMNS = 24
 
@@ -78,6 +83,7 @@ class RigidBodies:
     def __init__(self, kernels, capacity: int, planes: int, contacts: int):
         self.kernels, self.dim = kernels, kernels.dim
         self.capacity, self.planes_at_most = capacity, planes
+        self.share = ti.Vector.field(2, ti.f32, kernels.nodes)  # of a node: rigid mass, filled share of a cell
         self.rest = ti.Vector.field(self.dim, ti.f32, kernels.capacity)  # a particle's place in its body
         self.count, self.touching = ti.field(ti.i32, ()), ti.field(ti.i32, ())
         self.half = ti.field(ti.f32, ())  # half a particle spacing, cells
@@ -96,13 +102,14 @@ class RigidBodies:
         self.impulse = ti.Vector.field(4, ti.f32, contacts)  # impulse on the first body, friction coefficient
 
     @staticmethod
-    def sizes(dim: int, bodies: int, planes: int, capacity: int) -> dict[str, tuple[int, int]]:
+    def sizes(dim: int, bodies: int, planes: int, capacity: int, nodes: int) -> dict[str, tuple[int, int]]:
         """Fields with more than a few entries: name -> (bytes an entry, entries), as ``MPMSimulator.plan`` lists them."""
         rigid = {"span": 8, "mass": 4, "reach": 4, "radius": 4, "centre": 12, "velocity": 12, "spin": 12, "turn": 16, "inertia": 36, "inverse": 36,
                  "rest inverse": 36, "faces": 4, "saved centre": 12, "saved velocity": 12, "saved spin": 12, "saved turn": 16}
         contact = {"pair": 8, "at": 12, "normal": 16, "impulse": 16}
         return ({f"rigid {name}": (size, bodies) for name, size in rigid.items()} | {"rigid planes": (16, bodies * planes)}
-                | {"rigid rest": (4 * dim, capacity)} | {f"contact {name}": (size, capacity) for name, size in contact.items()})
+                | {"rigid rest": (4 * dim, capacity), "rigid share": (8, nodes)}
+                | {f"contact {name}": (size, capacity) for name, size in contact.items()})
 
     # -- set-up
     @ti.func
@@ -150,12 +157,17 @@ class RigidBodies:
     def meet(self, dt):
         """Motion from the grid's momenta, and the contacts that it makes. ``solve`` follows, then ``advance``; all on one thread."""
         for b in range(self.count[None]):
+            self.fill(b)
+        for b in range(self.count[None]):
             self.gather(b, dt)
         self.find_contacts(dt)
 
     @ti.func
     def advance(self, dt):
         """To the bodies' new places; returns the largest squared speed of a particle."""
+        for clear in ti.static((True, False)):
+            for b in range(self.count[None]):
+                self.carry(b, dt, clear)
         fastest = 0.0
         for b in range(self.count[None]):
             self.move(b, dt)
@@ -164,38 +176,81 @@ class RigidBodies:
         return fastest
 
     @ti.func
+    def fill(self, b):
+        """Add a body's mass and volume to the nodes."""
+        volume = (2.0 * self.half[None]) ** self.dim
+        for p in range(self.span[b][0], self.span[b][1]):
+            base, fx = self.kernels.locate(self.kernels.x[p])
+            for n in range(3**self.dim):
+                node, weight, arm = self.node(b, base, fx, n)
+                self.share[node] += weight * ti.Vector([self.mass[b], volume])
+
+    @ti.func
+    def node(self, b, base, fx, n):
+        """The n-th of the nodes that a particle reaches, its weight, and its place from the body's centre [3]."""
+        node, weight, rest, arm = base, 1.0, n, -self.centre[b]
+        for d in ti.static(range(self.dim)):
+            k = rest % 3
+            rest = rest // 3
+            node[d] = base[d] + k
+            weight *= self.kernels.weights(fx[d])[k]
+            arm[d] += ti.cast(node[d], ti.f32)
+        return node, weight, arm
+
+    @ti.func
     def gather(self, b, dt):
-        """V and spin from the grid; sums are of differences from the old V, which keeps the digits of a steady motion."""
-        old, centre = self.velocity[b], self.centre[b]
-        P, L, n = ti.Vector.zero(ti.f32, 3), ti.Vector.zero(ti.f32, 3), 0.0
+        """The nearest rigid motion; sums are of differences from the old V, which keeps the digits of a steady motion."""
+        old = self.velocity[b]
         pull = ti.Vector.zero(ti.f32, 3)
         for d in ti.static(range(self.dim)):
             pull[d] = dt * self.kernels.pull[None][d]
+        M, P, L, S = 0.0, ti.Vector.zero(ti.f32, 3), ti.Vector.zero(ti.f32, 3), ti.Vector.zero(ti.f32, 3)
+        second = ti.Matrix.zero(ti.f32, 3, 3)
         for p in range(self.span[b][0], self.span[b][1]):
             base, fx = self.kernels.locate(self.kernels.x[p])
-            n += 1.0
-            wx, wy = self.kernels.weights(fx[0]), self.kernels.weights(fx[1])
-            wz = self.kernels.weights(fx[self.dim - 1])
-            for i in range(3):
-                for j in range(3):
-                    for k in range(ti.static(1 if self.dim == 2 else 3)):
-                        node = ti.Vector.zero(ti.i32, self.dim)
-                        node[0], node[1] = base[0] + i, base[1] + j
-                        weight = wx[i] * wy[j]
-                        if ti.static(self.dim == 3):
-                            node[2] = base[2] + k
-                            weight *= wz[k]
-                        cell = self.kernels.grid[node]
-                        mass = ti.max(cell[self.dim], 1e-30)
-                        v, arm = pull - old, -centre
+            for n in range(3**self.dim):
+                node, weight, arm = self.node(b, base, fx, n)
+                cell, share = self.kernels.grid[node], self.share[node]
+                mass, mu = ti.max(cell[self.dim], 1e-30), weight * self.mass[b]
+                if share[1] >= SOLID:
+                    mu *= ti.max(mass / share[0], 1.0)
+                v = pull - old
+                for d in ti.static(range(self.dim)):
+                    v[d] += cell[d] / mass
+                M += mu
+                P += mu * v
+                S += mu * arm
+                L += mu * arm.cross(v)
+                second += mu * arm.outer_product(arm)
+        # About the centroid of mu, the two sums part.
+        middle, mean = S / M, P / M
+        second -= M * middle.outer_product(middle)
+        inertia = second.trace() * ti.Matrix.identity(ti.f32, 3) - second
+        spin = inertia.inverse() @ (L - M * middle.cross(mean))
+        self.velocity[b] = old + mean - spin.cross(middle)
+        self.spin[b] = spin / self.kernels.dx[None]
+
+    @ti.func
+    def carry(self, b, dt, clear: ti.template()):
+        """Filled nodes move with the body: ``clear`` them of momentum, then give them the body's, in its share of their rigid mass.
+
+        Gravity, which the nodes' update will add, is taken off first.
+        """
+        pull, dx = dt * self.kernels.pull[None], self.kernels.dx[None]
+        for p in range(self.span[b][0], self.span[b][1]):
+            base, fx = self.kernels.locate(self.kernels.x[p])
+            for n in range(3**self.dim):
+                node, weight, arm = self.node(b, base, fx, n)
+                share = self.share[node]
+                if share[1] >= SOLID:
+                    if ti.static(clear):
                         for d in ti.static(range(self.dim)):
-                            v[d] += cell[d] / mass
-                            arm[d] += ti.cast(node[d], ti.f32)
-                        P += weight * v
-                        L += weight * arm.cross(v)
-        # About the centre, the old V itself has no angular momentum: sum m r = 0.
-        self.velocity[b] = old + P / n
-        self.spin[b] = self.inverse[b] @ (self.mass[b] * L) / self.kernels.dx[None]
+                            self.kernels.grid[node][d] = 0.0
+                    else:
+                        mu = weight * self.mass[b] * self.kernels.grid[node][self.dim] / share[0]
+                        u = self.velocity[b] + dx * self.spin[b].cross(arm)
+                        for d in ti.static(range(self.dim)):
+                            self.kernels.grid[node][d] += mu * (u[d] - pull[d])
 
     @ti.func
     def touch(self, b, other, at, normal, gap, friction, dt):

@@ -377,6 +377,12 @@ class _Kernels:
         return low, high
 
     @ti.func
+    def clear(self, I):
+        self.grid[I] = ti.Vector.zero(ti.f32, 4)
+        if ti.static(self.has_rigid):
+            self.rigid.share[I] = ti.Vector.zero(ti.f32, 2)
+
+    @ti.func
     def collect(self, low, high, dt):
         """Nodes, walls and ghosts, then grid to particles; leaves the grid empty. Returns the largest squared speed."""
         self.at_walls(low, high, dt, before=True)
@@ -401,12 +407,12 @@ class _Kernels:
         if ti.static(self.dim == 2):
             for i in range(low[0], high[0] + 3):
                 for j in range(low[1], high[1] + 3):
-                    self.grid[i, j] = ti.Vector.zero(ti.f32, 4)
+                    self.clear(ti.Vector([i, j]))
         else:
             for i in range(low[0], high[0] + 3):
                 for j in range(low[1], high[1] + 3):
                     for k in range(low[2], high[2] + 3):
-                        self.grid[i, j, k] = ti.Vector.zero(ti.f32, 4)
+                        self.clear(ti.Vector([i, j, k]))
         return fastest
 
     @ti.kernel
@@ -515,7 +521,7 @@ class _Kernels:
             for p in range(self.range[m], self.range[m + 1]):
                 ti.atomic_max(sums[5], ti.cast(self.g2p(p, dt), ti.f64))
         for I in ti.grouped(self.grid):
-            self.grid[I] = ti.Vector.zero(ti.f32, 4)
+            self.clear(I)
 
     @ti.kernel
     def report_parallel(self, position: ti.types.ndarray(ti.f32, 2), sums: ti.types.ndarray(ti.f64, 1)):
@@ -552,7 +558,7 @@ class _Kernels:
                 self.v[p][self.dim] = 1.0
                 self.materials[m].reset(p)
         for I in ti.grouped(self.grid):
-            self.grid[I] = ti.Vector.zero(ti.f32, 4)
+            self.clear(I)
 
     @ti.kernel
     def load_rigid(self, table: ti.types.ndarray(ti.f64, 2)):
@@ -592,7 +598,7 @@ class _Kernels:
             for f in ti.static(range(len(self.state))):
                 self.state[f][p] = self.saved[f][p]
         for I in ti.grouped(self.grid):
-            self.grid[I] = ti.Vector.zero(ti.f32, 4)
+            self.clear(I)
 
 
 def _frictions(scene: Scene) -> list:
@@ -713,7 +719,7 @@ class MPMSimulator:
         rigid = [body for body in scene.bodies if scene.materials[body.material].model == "rigid"]
         faces = max((len(body.vertices) if body.vertices else 6 for body in rigid), default=0)
         # Rounded up, so that scenes of a family share their kernels.
-        limits = (_power_of_two(len(rigid)), 6 if faces <= 6 else 64) if rigid else None
+        limits = (_power_of_two(len(rigid)), 6 if faces <= 6 else _power_of_two(faces)) if rigid else None
         return Structure(scene.dim, models, walls, obstacles, scene.container is not None, limits)
 
     def _fewest(self, scene: Scene, dx: float) -> int:
@@ -768,7 +774,7 @@ class MPMSimulator:
         if structure.rigid is None:
             left_out["rigid bodies"] = "none in the scene"
         else:
-            fields |= RigidBodies.sizes(dim, *structure.rigid, n)
+            fields |= RigidBodies.sizes(dim, *structure.rigid, n, nodes)
             kernels[2:] = ["save", "spread_serial", "meet_rigid", "solve_rigid", "move_rigid", "collect_serial", "report_parallel", "load_rigid",
                            "keep_rigid"]
         speeds = [MODELS[material.model].rest_wave_speed(material, self.settings["stiffness"]) for material in scene.materials.values()]
