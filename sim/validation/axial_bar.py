@@ -20,7 +20,7 @@ def run(resolution: int) -> Outcome:
     """
     dx, stiffness = THICKNESS / resolution, E / (1 - NU**2)
     exact = 4 * L * np.sqrt(RHO / stiffness)
-    cells = [round(2.5 * L / dx), round(2 * THICKNESS / dx)]
+    cells = [round(2.5 * L / dx), round(4 * THICKNESS / dx)]
     lower = np.array([-cells[0] * dx / 2, -cells[1] * dx / 2])
     what = scene(
         "axial-bar", {"model": "elastic", "density": RHO, "young_modulus": E, "poisson_ratio": NU},

@@ -29,12 +29,11 @@ def test_every_case_has_three_resolutions(case):
     assert len(resolutions) == 3 and list(resolutions) == sorted(set(resolutions))
 
 
-def test_goop_without_yield_stress_levels_out_and_with_a_large_one_stands():
-    """The slump's column: a (viscous) fluid covers the floor evenly; an elastic solid keeps its walls."""
-    x, position, h, *_ = slump(20, yield_stress=0.0)
-    level = HALF * HEIGHT / BOX[0]
-    # Half a cell of its depth, at 1.5 cells.
-    assert np.abs(h - level).max() <= 0.5 / 20 and np.abs(position[:, 0]).max() > 0.95 * BOX[0]
+def test_goop_without_yield_stress_runs_on_and_with_a_large_one_stands():
+    """The slump's column: a viscous fluid goes on to the walls, far beyond where goop of the case stops (0.48); an elastic solid stands."""
+    _, position, *_ = slump(20, yield_stress=0.0)
+    assert np.abs(position[:, 0]).max() > 0.9 * BOX[0] and position[:, 1].max() < 0.6 * HEIGHT
     x, position, h, *_ = slump(20, yield_stress=1e9)
     assert np.abs(position[:, 0]).max() < HALF * 1.03
-    assert h[np.abs(x) < 0.8 * HALF] == pytest.approx(HEIGHT, rel=0.05)
+    # Its weight shortens it by rho g H / 2 M = 0.6 % and widens it as much; a cell at the rim may hold a column of particles less.
+    assert h[np.abs(x) < 0.7 * HALF] == pytest.approx(HEIGHT, rel=0.03)

@@ -47,11 +47,10 @@ _made = {}
 
 def samples(name, dim, material=None):
     """N fresh particles of a material of ``MATERIALS``, or of other numbers with the same structure."""
-    material = material or MATERIALS[name]
-    model = MODELS[material.model]
+    model = MODELS[MATERIALS[name].model]
     if (name, dim) not in _made:
-        _made[name, dim] = Experiments(model, dim, N, *model.options(material))
-    _made[name, dim].set(material)
+        _made[name, dim] = Experiments(model, dim, N, *model.options(MATERIALS[name]))
+    _made[name, dim].set(material or MATERIALS[name])
     _made[name, dim].reset()
     return _made[name, dim]
 
