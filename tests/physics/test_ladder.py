@@ -8,16 +8,22 @@ import pytest
 from sim.validation import CASES, Curve, Outcome
 from sim.validation.ladder import main, module, order, page
 
-#: Cases held to their tolerance by every test run, at this place among their resolutions.
-HERE = {"rotation": 1, "return_map": 1, "hydrostatics": 1, "standing_wave": 1, "dam_break": 1}
+#: Cases that hold, each at the least resolution that is worth its time. Those that do not hold yet are in docs/validation.md.
+AFFORDABLE = {
+    "rotation": 32, "return_map": 1000, "hydrostatics": 32, "elastic_column": 16, "axial_bar": 4, "cantilever": 4, "standing_wave": 32,
+    "dam_break": 16, "block_on_plane": 32, "elastic_discs": 40, "viscoplastic_slump": 40,
+}
 
 
 @pytest.mark.physics
-@pytest.mark.parametrize(("case", "place"), HERE.items(), ids=HERE)
-def test_case(case, place):
-    outcome = module(case).run(module(case).RESOLUTIONS[place])
-    for curve in outcome.curves.values():
-        assert curve.passed, (curve.label, curve.error)
+@pytest.mark.parametrize("case", AFFORDABLE)
+def test_case(case):
+    outcome = module(case).run(AFFORDABLE[case])
+    assert outcome.case == case and outcome.resolution == AFFORDABLE[case] and outcome.seconds > 0 and outcome.particles > 0
+    for name, curve in outcome.curves.items():
+        assert len(curve.x) == len(curve.ours) == len(curve.reference), name
+        assert np.isfinite(curve.ours).all(), name
+        assert curve.passed, f"{name}: {curve.label}: {curve.error:.4g}, tolerance {curve.tolerance:.4g}"
 
 
 def outcomes(case, *errors):

@@ -1,33 +1,11 @@
-"""Cases of ``sim.validation`` at the least resolution that is worth its time, held to the tolerances that they carry."""
-
-import importlib
+"""Materials in motion, beside the cases of ``sim.validation`` (test_ladder.py)."""
 
 import numpy as np
 import pytest
 
-from sim.validation import CASES
 from sim.validation.viscoplastic_slump import BOX, HALF, HEIGHT, slump
 
 pytestmark = pytest.mark.physics
-
-AFFORDABLE = {"return_map": 1000, "elastic_column": 16, "axial_bar": 4, "cantilever": 4, "elastic_discs": 40, "viscoplastic_slump": 40}
-
-
-@pytest.mark.parametrize("case", CASES)
-def test_case(case):
-    outcome = importlib.import_module(f"sim.validation.{case}").run(AFFORDABLE[case])
-    assert outcome.case == case and outcome.resolution == AFFORDABLE[case] and outcome.seconds > 0 and outcome.particles > 0
-    for name, curve in outcome.curves.items():
-        assert len(curve.x) == len(curve.ours) == len(curve.reference), name
-        assert np.isfinite(curve.ours).all(), name
-        assert curve.passed, f"{name}: {curve.label}: {curve.error:.4g}, tolerance {curve.tolerance:.4g}"
-
-
-@pytest.mark.parametrize("case", CASES)
-def test_every_case_has_three_resolutions(case):
-    resolutions = importlib.import_module(f"sim.validation.{case}").RESOLUTIONS
-    assert len(resolutions) == 3 and list(resolutions) == sorted(set(resolutions))
-
 
 def test_goop_without_yield_stress_runs_on_and_with_a_large_one_stands():
     """The slump's column: a viscous fluid goes on to the walls, far beyond where goop of the case stops (0.48); an elastic solid stands."""
