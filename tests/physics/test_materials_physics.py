@@ -7,6 +7,7 @@ from sim.validation.viscoplastic_slump import BOX, HALF, HEIGHT, slump
 
 pytestmark = pytest.mark.physics
 
+
 def test_goop_without_yield_stress_runs_on_and_with_a_large_one_stands():
     """The slump's column: a viscous fluid goes on to the walls, far beyond where goop of the case stops (0.48); an elastic solid stands."""
     _, position, *_ = slump(20, yield_stress=0.0)
