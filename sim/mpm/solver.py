@@ -495,10 +495,9 @@ class MPMSimulator:
         step = min(MODELS[material.model].largest_step(material, scene.dim, dx) for material in scene.materials.values())
         return max(1, int(np.ceil(scene.frame_step / step)))
 
-    def _ringing(self, scene: Scene, dx: float, wave_speed: float = 0.0) -> int:
-        """Substeps a frame that a lone particle asks for (``LONE_PARTICLE``): at rest, or where waves are faster."""
-        rest = max(MODELS[material.model].rest_wave_speed(material, self.settings["stiffness"]) for material in scene.materials.values())
-        return int(np.ceil(scene.frame_step * max(rest, wave_speed) * np.sqrt(scene.dim) / (LONE_PARTICLE * dx)))
+    def _ringing(self, scene: Scene, dx: float, wave_speed: float) -> int:
+        """Substeps a frame that a lone particle asks for (``LONE_PARTICLE``)."""
+        return int(np.ceil(scene.frame_step * wave_speed * np.sqrt(scene.dim) / (LONE_PARTICLE * dx)))
 
     def plan(self, scene: Scene) -> dict:
         """What ``load`` would build for a scene, without building it.
@@ -531,7 +530,7 @@ class MPMSimulator:
         start = float(np.sqrt((particles.velocity**2).sum(1).max()))
         fall = float(np.sqrt(start**2 + 2 * gravity * np.linalg.norm(upper - lower)))
         limit, fewest = (self.settings["cfl"] or scene.cfl) * dx, self._fewest(scene, dx)
-        fewest = max(fewest, self._ringing(scene, dx))
+        fewest = max(fewest, self._ringing(scene, dx, max(speeds)))
         substeps = [max(fewest, int(np.ceil(scene.frame_step * (max(speeds) + v + gravity * scene.frame_step) / limit))) for v in (0.0, fall)]
         return {
             "dim": dim, "materials": [name for name, *_ in models], "walls": friction, "kernels": ["load", "restore", "frame_serial"],
