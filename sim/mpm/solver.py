@@ -28,9 +28,10 @@ WALL = 1
 #: A frame whose Courant number grew beyond this multiple of the requested one is taken back and repeated with half the step.
 COURANT_GROWTH = 1.5
 #: A particle alone on the grid is an oscillator: its stress turns its own velocity gradient about at w = 2 sqrt(dim) c / dx, and symplectic
-#: Euler needs w dt < 2, that is sqrt(dim) c dt < dx. Planned with a margin, for near the limit amplitudes are large. Whole bodies bear more,
-#: so this binds at Courant numbers above 0.9 / sqrt(dim); without it the volume of a lone drop of water ran away there.
-LONE_PARTICLE = 0.9
+#: Euler needs w dt < 2, that is sqrt(dim) c dt < dx. Planned between the strong resonances of large swings, w dt = sqrt(2) and sqrt(3).
+#: Whole bodies bear more, so this binds at Courant numbers above 0.8 / sqrt(dim), where the volume of lone drops of water ran away.
+#: It is necessary, not sufficient: nothing damps a lone particle, and swings of 5 % may still grow until the trajectory fails.
+LONE_PARTICLE = 0.8
 #: Halvings of the planned step before a trajectory is given up.
 MAX_HALVINGS = 6
 
@@ -662,7 +663,7 @@ class MPMSimulator:
             kernels.load_rigid(body_table(scene, particles, data[:, : scene.dim].astype(float), self.dx, WALL, structure.rigid[1]))
         self._acceleration, self._frame, self._boundary = scene.acceleration(), 0, scene.boundary.astype(np.float32)
         self._cfl, self._least = self.settings["cfl"] or scene.cfl, self._fewest(scene, self.dx)
-        self._rings = self._ringing(scene, 1.0, self.dx) > 0
+        self._rings = self._ringing(scene, self.dx, 1.0) > 0
         self._position = np.zeros((len(position), scene.dim), np.float32)
         if fresh:
             # Compiles all that a frame needs; the tiny step is taken back.
@@ -727,7 +728,7 @@ class MPMSimulator:
         step = min(MODELS[material.model].largest_step(material, scene.dim, dx) for material in scene.materials.values())
         return max(1, int(np.ceil(scene.frame_step / step)))
 
-    def _ringing(self, scene: Scene, wave_speed: float, dx: float) -> int:
+    def _ringing(self, scene: Scene, dx: float, wave_speed: float) -> int:
         """Substeps a frame that a lone particle asks for (``LONE_PARTICLE``); none where every material goes slack when it is parted."""
         if not any(MODELS[material.model].rings(material) for material in scene.materials.values()):
             return 0
@@ -782,7 +783,7 @@ class MPMSimulator:
         start = float(np.sqrt((particles.velocity**2).sum(1).max()))
         fall = float(np.sqrt(start**2 + 2 * gravity * np.linalg.norm(upper - lower)))
         limit, fewest = (self.settings["cfl"] or scene.cfl) * dx, self._fewest(scene, dx)
-        fewest = max(fewest, self._ringing(scene, max(speeds), dx))
+        fewest = max(fewest, self._ringing(scene, dx, max(speeds)))
         substeps = [max(fewest, int(np.ceil(scene.frame_step * (max(speeds) + v + gravity * scene.frame_step) / limit))) for v in (0.0, fall)]
         return {
             "dim": dim, "materials": [name for name, *_ in models], "walls": friction, "obstacles": len(scene.obstacles),
@@ -813,7 +814,7 @@ class MPMSimulator:
         felt = scene.gravity - self._acceleration[min(self._frame, len(self._acceleration) - 1)]
         reach = float(np.linalg.norm(felt)) * scene.frame_step
         courant = int(np.ceil(scene.frame_step * (known["wave_speed"] + known["max_speed"] + reach) / (self._cfl * self.dx)))
-        substeps = max(self._least, courant, self._ringing(scene, known["wave_speed"], self.dx))
+        substeps = max(self._least, courant, self._ringing(scene, self.dx, known["wave_speed"]))
         for attempt in range(MAX_HALVINGS + 1):
             dt = scene.frame_step / substeps
             sums = self._run(substeps, dt, keep=attempt == 0)

@@ -11,7 +11,7 @@ from sim.taichi_runtime import ti
 class SandModel(Principal):
     """Drucker-Prager elastoplastic sand (Klar et al. 2016, sec. 6) with volume correction (Tampubolon et al. 2017, sec. 4.3.4).
 
-    Yield surface |dev e| + k tr e = a, k = alpha (d lambda + 2 mu) / (2 mu). In 2D alpha = sin(phi) / sqrt(2), which gives
+    Yield surface |dev e| + k (tr e - tip) = 0, k = alpha (d lambda + 2 mu) / (2 mu). In 2D alpha = sin(phi) / sqrt(2), which gives
     |s1 - s2| = sin(phi) |s1 + s2| exactly; in 3D alpha = sqrt(2/3) 2 sin(phi) / (3 - sin(phi)) (compression cone). The tip
     lies at tr tau = d C cot(phi) for a cohesion C (0: in tension the stress is zero). The volume gained beyond the tip is
     remembered (``v``) and given back before pressure builds up.
