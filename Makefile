@@ -8,7 +8,7 @@ STUDY ?= demo
 INSTALLED := $(VENV)/.installed-$(shell cat constraints.txt pyproject.toml | sha256sum | cut -c1-16)
 SNAKEMAKE = $(PY) -m snakemake --config study=configs/studies/$(STUDY).yaml
 
-.PHONY: demo smoke study resume test bench setup system
+.PHONY: demo smoke study resume test validate gallery bench setup system
 .DEFAULT_GOAL := demo
 
 demo: ## the demonstration: results/demo/report.html, in about twenty minutes on two cores
@@ -28,6 +28,12 @@ resume: setup ## after a kill or a power cut: make resume STUDY=demo continues w
 test: setup
 	@$(PY) -m ruff check .
 	@$(PY) -m pytest -n 2 --dist loadfile
+
+validate: setup ## the solvers against formulae and experiments, at three resolutions: docs/validation.md
+	@$(PY) -m sim.validation
+
+gallery: setup ## a film strip of every domain: docs/gallery.md
+	@$(PY) -m sim.gallery
 
 bench: setup
 	@for program in benchmarks/*.py; do echo "== $$program"; $(PY) $$program || exit 1; done

@@ -42,6 +42,8 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("--jobs", type=_at_least(1), default=1, help="processes, each on one thread (default 1)")
     command.add_argument("--seed", type=_at_least(0), default=0, help="base seed of the data set (default 0)")
     command.add_argument("--shard-size", type=_at_least(1), default=8, help="trajectories in a file (default 8)")
+    help_ = "refuse what is estimated to need more hours of one core (default 100)"
+    command.add_argument("--budget", type=float, default=100.0, metavar="HOURS", help=help_)
 
     command = commands.add_parser("plan", help="what a scene compiles and allocates, what it leaves out, memory and time; runs nothing")
     command.set_defaults(run=_plan)
@@ -52,6 +54,7 @@ def _parser() -> argparse.ArgumentParser:
     command = commands.add_parser("info", help="summary of a data set folder, a shard or a scene file")
     command.set_defaults(run=_info)
     command.add_argument("path", type=Path)
+    command.add_argument("--against-paper", action="store_true", help="a data set beside the published domain that its scene reproduces")
 
     command = commands.add_parser("validate", help="check every trajectory of a data set folder or a shard; one line for each fault")
     command.set_defaults(run=_validate)
@@ -62,6 +65,15 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("shard", type=Path)
     command.add_argument("--index", type=_at_least(0), help="trajectory index (default: the shard's first)")
     command.add_argument("--out", type=Path, required=True, help="the picture's file")
+
+    command = commands.add_parser("export", help="trajectories in the formats of viewers (ParaView, ...) and of other learners")
+    command.set_defaults(run=_export)
+    command.add_argument("source", type=Path, help="a data set folder or, for viewers, a shard")
+    command.add_argument("--format", choices=("vtkhdf", "ply", "vtu", "geoelements", "deepmind", "lagrangebench"), required=True)
+    command.add_argument("--out", type=Path, required=True, help="a new folder")
+    command.add_argument("--split", choices=("train", "valid", "test"), help="export this split (default: all)")
+    command.add_argument("--index", type=_at_least(0), help="viewers: only the trajectory with this index")
+    command.add_argument("--frames", metavar="START:STOP:STEP", help="viewers: only these frames; each part is optional, --frames=-1 is the last one")
     return parser
 
 
@@ -76,6 +88,7 @@ def _family(options: argparse.Namespace):
 
 def _generate(options: argparse.Namespace) -> int:
     from sim.generate import SPLITS, generate
+    from sim.plan import check_budget
 
     family = _family(options)
     if options.count is not None and options.split is None:
@@ -84,6 +97,7 @@ def _generate(options: argparse.Namespace) -> int:
     if options.count is not None:
         counts[options.split] = options.count
     counts = {split: count for split, count in counts.items() if count}
+    check_budget(family, sum(counts.values()), options.budget)
     content = generate(family, counts, options.out, jobs=options.jobs, seed=options.seed, shard_size=options.shard_size)
     for split in counts:
         entry = content["splits"][split]
@@ -104,8 +118,9 @@ def _plan(options: argparse.Namespace) -> int:
 
 def _info(options: argparse.Namespace) -> int:
     from sim.info import info_text
+    from sim.paper import against_paper
 
-    print(info_text(options.path))
+    print((against_paper if options.against_paper else info_text)(options.path))
     return 0
 
 
@@ -131,6 +146,17 @@ def _render(options: argparse.Namespace) -> int:
     from sim.render import render_trajectory
 
     render_trajectory(options.out, trajectory)
+    return 0
+
+
+def _export(options: argparse.Namespace) -> int:
+    from sim.export import export
+
+    done = export(options.source, options.out, options.format, split=options.split, index=options.index, frames=options.frames)
+    for split, index, status in done.failed:
+        print(f"left out: {split} {index:06d}: {status}")
+    counts = ", ".join(f"{split or 'shard'} {count}" for split, count in done.trajectories.items())
+    print(f"{options.out}: trajectories as {options.format}: {counts}; {len(done.failed)} failed left out")
     return 0
 
 

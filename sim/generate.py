@@ -33,11 +33,10 @@ from tqdm import tqdm
 
 from sim import __version__
 from sim.errors import InputError, RunError
-from sim.scene import Scene, SceneFamily
+from sim.scene import SPLITS, Scene, SceneFamily
 from sim.simulator import SimulationError
 from sim.trajectory import FORMAT_VERSION, ShardReader, Trajectory, write_json, write_shard
 
-SPLITS = ("train", "valid", "test")
 DEFAULT_SHARD_SIZE = 8
 
 #: Frames of a trajectory, and trajectories of a split, on which neighbours are counted: a mean over 96 clouds is enough.
@@ -86,7 +85,7 @@ def simulate(teacher: Teacher, scene: Scene) -> Trajectory:
     A failure (``SimulationError``, a non-finite position) ends the run: the trajectory keeps its finite frames and its
     ``status`` says why and at which frame.
     """
-    start, kinds = scene.particles(refine=1).position, scene.particle_type()
+    start, kinds = scene.start(), scene.particle_type()
     position = np.empty((scene.frames, *start.shape), np.float32)
     position[0] = start
     diagnostics: dict[str, list[float]] = {}
@@ -104,10 +103,11 @@ def simulate(teacher: Teacher, scene: Scene) -> Trajectory:
     except SimulationError as error:
         status = f"failed: {error} (frame {done})"
     settings = {"name": teacher.name, "kind": teacher.kind, "settings": teacher.settings, "version": __version__}
+    context = scene.context_values()
     return Trajectory(
         position=position[:done], particle_type=kinds, frame_step=scene.frame_step, radius=scene.radius,
         bounds=np.asarray(scene.bounds, float), scene=scene.to_dict(), seed=scene.seed, simulator=settings, status=status,
-        diagnostics={name: np.asarray(values[:done]) for name, values in diagnostics.items()},
+        context=None if context is None else context[:done], diagnostics={name: np.asarray(values[:done]) for name, values in diagnostics.items()},
     )
 
 
@@ -169,7 +169,7 @@ def generate(
 
 def _plan_shards(family: SceneFamily, split: str, count: int, seed: int, shard_size: int) -> list[Shard]:
     """All scenes of the split, sampled, so that a scene that cannot be sampled stops the run before it starts."""
-    scenes = {index: family.sample(trajectory_seed(seed, split, index)) for index in range(count)}
+    scenes = {index: family.sample(trajectory_seed(seed, split, index), split) for index in range(count)}
     return [
         Shard(split, number, {index: scenes[index] for index in range(first, min(first + shard_size, count))})
         for number, first in enumerate(range(0, count, shard_size))
@@ -365,7 +365,7 @@ def _run_workers(out: Path, shards: list[Shard], jobs: int, teacher: Callable[[]
             theirs.close()
             workers[ours] = process
         scenes = [scene for shard in shards for scene in shard.scenes.values()]
-        largest = max(scenes, key=lambda scene: len(scene.particle_type()))
+        largest = max(scenes, key=lambda scene: len(scene.particles(refine=1).position))
         while workers:
             for connection in wait(list(workers)):
                 try:
@@ -528,6 +528,7 @@ class _Moments:
 class _ShardStatistics:
     velocity: _Moments = field(default_factory=_Moments)
     acceleration: _Moments = field(default_factory=_Moments)
+    context: _Moments = field(default_factory=_Moments)
     particles: list[int] = field(default_factory=list)
     frames: list[int] = field(default_factory=list)
     neighbours: list[float] = field(default_factory=list)
@@ -542,6 +543,8 @@ def _shard_statistics(path: Path, neighbour_stride: int) -> _ShardStatistics:
             velocity = np.diff(position, axis=0)
             result.velocity.add(velocity)
             result.acceleration.add(np.diff(velocity, axis=0))
+            if trajectory.context is not None:
+                result.context.add(trajectory.context.astype(np.float64))
             result.particles.append(trajectory.position.shape[1])
             result.frames.append(len(position))
             if index % neighbour_stride == 0:
@@ -555,8 +558,8 @@ def training_statistics(shards: list[Path], jobs: int = 1) -> dict | None:
     """Statistics of a training split, streamed over its shards, ``jobs`` at a time; None without a trajectory.
 
     velocity p_t - p_(t-1) and acceleration p_(t+1) - 2 p_t + p_(t-1), length per frame (squared), mean and std per axis in
-    float64 over all frames and moving particles; particles [min, mean, max]; frames (the most); neighbours: mean
-    number of particles within the radius, self included, on a sample of frames.
+    float64 over all frames and moving particles; context (where there is one), over all frames; particles [min, mean, max];
+    frames (the most); neighbours: mean number of particles within the radius, self included, on a sample of frames.
     """
     indices: list[int] = []
     for path in shards:
@@ -567,7 +570,7 @@ def training_statistics(shards: list[Path], jobs: int = 1) -> dict | None:
     stride = max(1, (max(indices) + 1) // _NEIGHBOUR_TRAJECTORIES)
     if not any(index % stride == 0 for index in indices):
         stride = 1
-    velocity, acceleration = _Moments(), _Moments()
+    velocity, acceleration, context = _Moments(), _Moments(), _Moments()
     particles: list[int] = []
     frames: list[int] = []
     neighbours: list[float] = []
@@ -576,10 +579,13 @@ def training_statistics(shards: list[Path], jobs: int = 1) -> dict | None:
         for part in pool.map(lambda path: _shard_statistics(path, stride), shards):
             velocity.merge(part.velocity)
             acceleration.merge(part.acceleration)
+            context.merge(part.context)
             particles += part.particles
             frames += part.frames
             neighbours += part.neighbours
     statistics = dict(zip(("velocity_mean", "velocity_std"), velocity.result(), strict=True))
     statistics |= dict(zip(("acceleration_mean", "acceleration_std"), acceleration.result(), strict=True))
+    if context.count:
+        statistics |= dict(zip(("context_mean", "context_std"), context.result(), strict=True))
     statistics |= {"particles": [min(particles), float(np.mean(particles)), max(particles)], "frames": max(frames)}
     return statistics | {"neighbours": float(np.mean(neighbours))}

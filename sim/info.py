@@ -87,7 +87,13 @@ def _scene_text(path: Path) -> str:
         f"{model.grid_spacing:.4g}" + (f"; the teacher is {model.refine} times finer" if model.refine > 1 else ""),
         f"  particles in {_SAMPLES} draws: {min(counts)} to {max(counts)}, mean {np.mean(counts):.0f}",
     ]
-    lines += [f"  material {name}: {material.model_dump(mode='json')}" for name, material in model.materials.items()]
+    content = family.to_dict()
+    lines += [f"  material {name}: {material}" for name, material in content["materials"].items()]
+    lines += [f"  obstacles: {obstacle}" for obstacle in content.get("obstacles", [])]
+    if model.container is not None:
+        lines.append(f"  container: {content['container']}")
+    if model.context:
+        lines.append(f"  context: {', '.join(model.context)}")
     lines.append(f"  splits: {', '.join(f'{split} {getattr(model.splits, split)}' for split in SPLITS)}")
     if model.variants:
         lines.append(f"  variants: {', '.join(model.variants)}")

@@ -6,12 +6,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sim.errors import InputError
 from sim.generate import SPLITS, trajectory_seed
 from sim.scene import SceneFamily
 
 #: Particle-substeps per second of one core, by dimension and the slowest material present: the order of a 2-core cloud machine of
-#: 2023. ``make bench`` measures this machine's.
-RATES = {(2, "water"): 12e6, (2, "sand"): 6e6, (3, "water"): 4e6, (3, "sand"): 1.5e6}
+#: 2023. ``make bench`` measures this machine's water and sand; goop, elastic and snow in 2D were measured against them (0.9, 1.25 and 0.7
+#: times sand), elastic in 3D by itself; goop and snow in 3D are guesses from sand, whose decomposition they share.
+RATES = {
+    (2, "water"): 12e6, (2, "sand"): 6e6, (2, "goop"): 5.5e6, (2, "elastic"): 7.5e6, (2, "snow"): 4e6, (2, "rigid"): 12e6,
+    (3, "water"): 4e6, (3, "sand"): 1.5e6, (3, "goop"): 1.5e6, (3, "elastic"): 2.5e6, (3, "snow"): 1.5e6, (3, "rigid"): 4e6,
+}
 
 #: Scenes drawn to describe a family.
 _SAMPLES = 8
@@ -49,6 +54,22 @@ def plan(family: SceneFamily) -> Plan:
     )
 
 
+def check_budget(family: SceneFamily, trajectories: int, budget: float) -> None:
+    """Refuse what is estimated to need more than ``budget`` hours of one core: stiff scenes are easily asked for and never finished.
+
+    Raises ``InputError`` with the estimate and what makes it.
+    """
+    found = plan(family)
+    hours = trajectories * found.seconds / 3600
+    if hours > budget:
+        remedy = (
+            f"{trajectories} trajectories x {found.particles:.0f} particles x {family.model.frames - 1} frames x "
+            f"{found.substeps[0]} to {found.substeps[1]} substeps (wave speed {found.solver['wave_speed']:.3g} m/s) need about {hours:.3g} hours "
+            f"of one core, more than the budget of {budget:g}; soften the material, ask for fewer, or raise --budget"
+        )
+        raise InputError(family.where, "--budget", budget, remedy)
+
+
 def _duration(seconds: float) -> str:
     for unit, length in (("h", 3600), ("min", 60)):
         if seconds >= length:
@@ -71,6 +92,9 @@ def plan_text(family: SceneFamily, jobs: int = 1) -> str:
         f"scene {model.name}: MLS-MPM, {solver['dim']}D, {', '.join(solver['materials'])}, {solver['walls']} walls",
         f"  particles: {found.recorded:.0f} recorded, {found.particles:.0f} simulated (mean of {_SAMPLES} draws); "
         f"{' x '.join(map(str, solver['cells']))} cells of {solver['grid_spacing']:.4g}",
+        *([f"  obstacles: {solver['obstacles']} in the largest draw, {solver['kinematic']} of its recorded particles are kinematic"]
+          if solver["obstacles"] else []),
+        *([f"  context: {solver['context']} numbers a frame"] if solver["context"] else []),
         f"  compiled: {', '.join(solver['kernels'])}",
         f"  allocated: {_size(solver['bytes'])}",
         *(f"    {name}: {entries} x {size} bytes" for name, (size, entries) in solver["fields"].items()),

@@ -34,7 +34,10 @@ MARGIN = 0.04  #: free share of a pane on each side of the box
 
 INK, MUTED, BOX = (34, 34, 34), (110, 110, 110), (178, 178, 178)
 KINEMATIC_GREY = (150, 150, 150)
-TYPE_COLOURS = {"rigid": (176, 84, 48), "boundary": KINEMATIC_GREY, "water": (47, 111, 171), "sand": (201, 162, 94), "goop": (104, 153, 82)}
+TYPE_COLOURS = {
+    "rigid": (176, 84, 48), "boundary": KINEMATIC_GREY, "water": (47, 111, 171), "sand": (201, 162, 94), "goop": (104, 153, 82),
+    "elastic": (146, 92, 160), "snow": (150, 200, 214),
+}
 
 _PROBE = """
 from vtkmodules.vtkCommonCore import vtkLogger
@@ -505,6 +508,10 @@ def _failure(position: np.ndarray) -> int | None:
     return int(np.argmax(lost)) if lost.any() else None
 
 
+def _several_kinds(trajectory: Trajectory) -> bool:
+    return len(np.unique(trajectory.particle_type[trajectory.moving])) > 1
+
+
 def render_trajectory(path: str | Path, trajectory: Trajectory, *, width: int | None = None) -> None:
     """A film (``.mp4``) or a strip of six moments (``.png``) of one trajectory, coloured by speed, or by type where several kinds move.
 
@@ -514,7 +521,7 @@ def render_trajectory(path: str | Path, trajectory: Trajectory, *, width: int | 
         render_strip(path, trajectory, width=width or 300)
         return
     frames = film_frames(len(trajectory.position))
-    if len(np.unique(trajectory.particle_type[trajectory.moving])) > 1:
+    if _several_kinds(trajectory):
         scale = type_scale(trajectory.particle_type)
         value = np.tile(trajectory.particle_type.astype(float), (len(frames), 1))
     else:
@@ -532,7 +539,7 @@ def render_strip(
     path: str | Path, trajectory: Trajectory, times: Sequence[float] | None = None, *,
     predictions: Mapping[str, np.ndarray] | None = None, first: int = 0, name: str = "solver", width: int = 300,
 ) -> None:  # fmt: skip
-    """A film strip: the trajectory at several times [s] side by side (default: six from ``first`` to the end), PNG.
+    """A film strip: the trajectory at several times [s] side by side (default: six from ``first`` to the end), PNG; colours as in a film.
 
     predictions: further rows, name -> [frames, particles, dim], whose frame 0 is the trajectory's frame ``first``. All rows
     share times, camera and speed limits (the trajectory's). Moments that a row lacks, or lost to a failure, are empty boxes.
@@ -540,8 +547,12 @@ def render_strip(
     count, step = len(trajectory.position), trajectory.frame_step
     chosen = np.linspace(first, count - 1, min(6, count - first)) if times is None else np.clip(np.asarray(times, float) / step, 0, count - 1)
     chosen = np.rint(chosen).astype(int)
-    truth = speeds(trajectory.position, chosen, step, trajectory.moving)
-    scale = speed_scale(truth)
+    if _several_kinds(trajectory) and not predictions:
+        truth = np.tile(trajectory.particle_type.astype(float), (len(chosen), 1))
+        scale = type_scale(trajectory.particle_type)
+    else:
+        truth = speeds(trajectory.position, chosen, step, trajectory.moving)
+        scale = speed_scale(truth)
     label = f"{name}, " if predictions else ""
     panes = [Pane(f"{label}t = {k * step:.2f} s", trajectory.position[k][None], value[None], scale) for k, value in zip(chosen, truth, strict=True)]
     nowhere = np.full((1, *trajectory.position.shape[1:]), np.nan, np.float32)

@@ -10,51 +10,121 @@ from __future__ import annotations
 import copy
 import json
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, Field, TypeAdapter, ValidationError, model_serializer, model_validator
 from scipy.spatial import ConvexHull, cKDTree
 
+from sim.container import Container, ContainerFamily
 from sim.errors import InputError
-from sim.trajectory import PARTICLE_TYPES
+from sim.fields import Finite, Friction, Positive, Range
+from sim.fields import Strict as _Strict
+from sim.fields import mistake as _mistake
+from sim.fields import sample as _sample
+from sim.obstacles import Obstacle, ObstacleFamily, boundary_particles, combine, outside
+from sim.trajectory import KINEMATIC_TYPE, PARTICLE_TYPES
 
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-#: A fixed number or a [low, high] range that is sampled uniformly.
-Range = Finite | tuple[Finite, Finite]
+#: Names of the splits, in the order that seeds count them.
+SPLITS = ("train", "valid", "test")
 
 _TRIES = 2000
 #: More particles than this in one body are a slip of the keyboard, and would exhaust the memory before anything could say so.
 _MOST_PARTICLES = 100_000_000
 
 
-class _Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+def _only(low: float, high: float, remedy: str) -> AfterValidator:
+    """low <= value < high, or an error with this remedy."""
+
+    def check(value: float) -> float:
+        if not low <= value < high:
+            raise _mistake("", value, remedy)
+        return value
+
+    return AfterValidator(check)
+
+
+#: Shear yield stress, cohesion or viscosity: from nothing to more than any particle will feel, but within float32.
+_Resistance = Annotated[Finite, _only(0, 1e30, "must not be negative, nor 1e30 or more (0 means none)")]
+
+
+_PoissonRatio = Annotated[Finite, _only(0, 0.5, "must lie in 0 .. 0.4999: at 1/2 a solid is incompressible and its wave speed infinite")]
 
 
 class Water(_Strict):
-    """Weakly compressible water, Tait pressure p = (rho0 c^2 / gamma) (J^-gamma - 1) (Batchelor 1967; Monaghan 1994, eq. 3)."""
+    """Weakly compressible water, Tait pressure p = (rho0 c^2 / gamma) (J^-gamma - 1) (Batchelor 1967; Monaghan 1994, eq. 3).
+
+    viscosity [Pa s]: dynamic, at reference density."""
 
     model: Literal["water"]
     density: Positive = 1000.0
     sound_speed: Positive
     gamma: Annotated[float, Field(ge=1, le=10)] = 7.0
+    viscosity: _Resistance = 0.0
 
 
-class Sand(_Strict):
-    """Cohesionless Drucker-Prager sand on Hencky strain (Klar et al. 2016). young_modulus [Pa], friction_angle [degrees]."""
+class _Solid(_Strict):
+    """density [kg/m^3], young_modulus [Pa]."""
+
+    density: Positive
+    young_modulus: Positive
+    poisson_ratio: _PoissonRatio = 0.3
+
+
+class Sand(_Solid):
+    """Drucker-Prager sand on Hencky strain (Klar et al. 2016). friction_angle [degrees], cohesion [Pa]."""
 
     model: Literal["sand"]
     density: Positive = 1800.0
-    young_modulus: Positive
-    poisson_ratio: Annotated[float, Field(ge=0, lt=0.5)] = 0.3
-    friction_angle: Annotated[float, Field(ge=0, lt=90)]
+    friction_angle: Annotated[Finite, _only(0, 90, "must lie in 0 .. 89 degrees: at 90 no slope would ever yield")]
+    cohesion: _Resistance = 0.0
+
+    @model_validator(mode="after")
+    def _has_a_tip(self) -> Sand:
+        if self.cohesion and self.friction_angle < 1:
+            raise _mistake("cohesion", self.cohesion, "needs a friction_angle of at least 1 degree, lest it carry any tension; use goop for less")
+        return self
 
 
-Material = Annotated[Water | Sand, Field(discriminator="model")]
+class Goop(_Solid):
+    """Von Mises viscoplastic goop on Hencky strain (Simo & Hughes 1998). yield_stress [Pa]: in shear, 0 is a fluid; viscosity [Pa s]."""
+
+    model: Literal["goop"]
+    density: Positive = 1000.0
+    yield_stress: _Resistance
+    viscosity: _Resistance = 0.0
+
+
+class Elastic(_Solid):
+    """Neo-Hookean rubber (Bonet & Wood 2008)."""
+
+    model: Literal["elastic"]
+    density: Positive = 1000.0
+
+
+class Snow(_Solid):
+    """Hardening snow (Stomakhin et al. 2013, table 2): singular values are held in [1 - critical_compression, 1 + critical_stretch]."""
+
+    model: Literal["snow"]
+    density: Positive = 400.0
+    young_modulus: Positive = 1.4e5
+    poisson_ratio: _PoissonRatio = 0.2
+    critical_compression: Annotated[float, Field(gt=0, lt=1)] = 0.025
+    critical_stretch: Annotated[float, Field(gt=0, le=1)] = 0.0075
+    hardening: Annotated[float, Field(ge=0, le=30)] = 10.0
+
+
+class Rigid(_Strict):
+    """Bodies that keep their shape exactly and move by the forces of everything around them."""
+
+    model: Literal["rigid"]
+    density: Positive
+
+
+Material = Annotated[Water | Sand | Goop | Elastic | Snow | Rigid, Field(discriminator="model")]
 
 
 class BoxShape(_Strict):
@@ -92,17 +162,13 @@ class BodyFamily(_Strict):
 class Walls(_Strict):
     """Separating walls with Coulomb friction: 0 is free slip, ``sticky`` holds everything that touches."""
 
-    friction: Annotated[float, Field(ge=0, allow_inf_nan=False)] | Literal["sticky"] = 0.0
+    friction: Friction = 0.0
 
 
 class Splits(_Strict):
     train: Annotated[int, Field(ge=0)]
     valid: Annotated[int, Field(ge=0)]
     test: Annotated[int, Field(ge=0)]
-
-
-def _sample(value: Range, rng: np.random.Generator) -> float:
-    return float(rng.uniform(*value)) if isinstance(value, tuple) else float(value)
 
 
 class _Physics(_Strict):
@@ -122,6 +188,14 @@ class _Physics(_Strict):
     cfl: Annotated[float, Field(gt=0, le=4)] = 0.4
     walls: Walls = Walls()
     materials: dict[str, Material]
+    #: Material numbers ("material.key") that every frame's context repeats, after the container's acceleration if there is one.
+    context: list[str] = []
+
+    @model_serializer(mode="wrap")
+    def _without_what_is_absent(self, handler) -> dict:
+        """A scene without obstacles, container or context reads as if there were no such thing."""
+        content = handler(self)
+        return {key: value for key, value in content.items() if key not in ("obstacles", "container", "context") or value}
 
     @property
     def grid_spacing(self) -> float:
@@ -154,16 +228,17 @@ class _Physics(_Strict):
             if self.dim == 3 and isinstance(material, Sand) and material.friction_angle > 36.9:
                 remedy = "a compression-matched Drucker-Prager cone cannot yield in triaxial extension above 36.9 degrees in 3D; use less"
                 raise _mistake(f"materials.{name}.friction_angle", material.friction_angle, remedy)
+        for index, entry in enumerate(self.context):
+            name, _, key = entry.partition(".")
+            if not isinstance(getattr(self.materials.get(name), key, None), float):
+                raise _mistake(f"context[{index}]", entry, "must be material.key with a number in it, as in sand.friction_angle")
         return self
-
-
-def _mistake(key: str, value: object, remedy: str) -> ValueError:
-    """A validator's error that carries key, value and remedy to ``explain_validation``."""
-    return ValueError(json.dumps({"key": key, "value": value, "remedy": remedy}))
 
 
 class _FamilyModel(_Physics):
     bodies: list[BodyFamily]
+    obstacles: list[ObstacleFamily] = []
+    container: ContainerFamily | None = None
     splits: Splits
     variants: dict[str, dict[str, Any]] = {}
 
@@ -171,6 +246,10 @@ class _FamilyModel(_Physics):
     def _bodies_fit(self) -> _FamilyModel:
         if not self.bodies or all(body.count[1] == 0 for body in self.bodies):
             raise _mistake("bodies", [], "an empty scene: add at least one body")
+        for index, obstacle in enumerate(self.obstacles):
+            obstacle.check(f"obstacles[{index}]", self.dim, self.grid_spacing)
+        if self.container is not None:
+            self.container.check(self.dim)
         for index, body in enumerate(self.bodies):
             where = f"bodies[{index}]"
             if body.material not in self.materials:
@@ -196,11 +275,13 @@ class _FamilyModel(_Physics):
 
 @dataclass(frozen=True)
 class Particles:
-    """position, velocity [n, dim] float64; material [n] (index into the scene's materials); tracked: indices of the recorded ones."""
+    """position, velocity [n, dim] float64; material, body [n] (indices into the scene's materials and bodies), both one contiguous
+    range a value; tracked: indices of the recorded ones."""
 
     position: np.ndarray
     velocity: np.ndarray
     material: np.ndarray
+    body: np.ndarray
     tracked: np.ndarray
     spacing: float
 
@@ -240,6 +321,8 @@ class Scene(_Physics):
 
     seed: Annotated[int, Field(ge=0)]
     bodies: list[Body]
+    obstacles: list[Obstacle] = []
+    container: Container | None = None
 
     def to_dict(self) -> dict:
         """Plain JSON, with the derived lengths beside the inputs for readers that are not this code."""
@@ -270,33 +353,61 @@ class Scene(_Physics):
         central = np.flatnonzero(reach <= reach.min() + 1e-9)
         parts = []
         names = list(self.materials)
-        for body in self.bodies:
+        for index, body in enumerate(self.bodies):
             lower, upper = body.extent()
             counts = np.maximum(np.rint((upper - lower) / spacing).astype(int), 1)
             start = (lower + upper) / 2 - counts * spacing / 2
             cubes = start + (np.stack(np.meshgrid(*[np.arange(c) for c in counts], indexing="ij"), -1).reshape(-1, dim) + 0.5) * spacing
             cubes = cubes[body.inside(cubes)]
             position = cubes[:, None] + offsets * spacing
-            position = position + rng.uniform(-0.5, 0.5, position.shape) * self.jitter * spacing / k
+            # A rigid body's particles are its shape: they stay on the lattice.
+            jitter = 0.0 if isinstance(self.materials[body.material], Rigid) else self.jitter
+            position = position + rng.uniform(-0.5, 0.5, position.shape) * jitter * spacing / k
             choice = central[rng.integers(len(central), size=len(cubes))]
             tracked = np.zeros(position.shape[:2], bool)
             tracked[np.arange(len(cubes)), choice] = True
-            parts.append((position.reshape(-1, dim), tracked.ravel(), names.index(body.material), body.velocity))
+            parts.append((position.reshape(-1, dim), tracked.ravel(), names.index(body.material), body.velocity, index))
         # Solvers loop over one contiguous range per material.
         parts.sort(key=lambda part: part[2])
         position = np.concatenate([part[0] for part in parts])
         tracked = np.concatenate([part[1] for part in parts])
         material = np.concatenate([np.full(len(part[0]), part[2]) for part in parts])
+        bodies = np.concatenate([np.full(len(part[0]), part[4]) for part in parts])
         velocity = np.concatenate([np.tile(np.asarray(part[3], float), (len(part[0]), 1)) for part in parts])
         if coarse:
-            position, velocity, material = position[tracked], velocity[tracked], material[tracked]
+            position, velocity, material, bodies = position[tracked], velocity[tracked], material[tracked], bodies[tracked]
             tracked = np.ones(len(position), bool)
-        return Particles(position, velocity, material, np.flatnonzero(tracked), spacing if coarse else spacing / k)
+        return Particles(position, velocity, material, bodies, np.flatnonzero(tracked), spacing if coarse else spacing / k)
+
+    @cached_property
+    def boundary(self) -> np.ndarray:
+        """[k, dim] float64: the kinematic particles of the obstacles, at the recorded spacing."""
+        return boundary_particles(self.obstacles, np.array(self.bounds), self.spacing) if self.obstacles else np.empty((0, self.dim))
+
+    def start(self) -> np.ndarray:
+        """[recorded particles, dim] float64 at frame 0: those that move, then the kinematic ones."""
+        return np.concatenate([self.particles(refine=1).position, self.boundary])
 
     def particle_type(self) -> np.ndarray:
-        """[recorded particles] int8, ids of ``PARTICLE_TYPES``."""
+        """[recorded particles] int8, ids of ``PARTICLE_TYPES``, in the order of ``start``."""
         kinds = np.array([PARTICLE_TYPES[material.model] for material in self.materials.values()], np.int8)
-        return kinds[self.particles(refine=1).material]
+        return np.concatenate([kinds[self.particles(refine=1).material], np.full(len(self.boundary), KINEMATIC_TYPE, np.int8)])
+
+    def acceleration(self) -> np.ndarray:
+        """[frames, dim] float64: what the box undergoes from each frame to the next, m/s^2; zero without a container."""
+        if self.container is None:
+            return np.zeros((self.frames, self.dim))
+        return self.container.acceleration(self.frames, self.frame_step)
+
+    def context_values(self) -> np.ndarray | None:
+        """[frames, c] float32: the box's acceleration (dim columns) if it is shaken, then the numbers that ``context`` names; None for neither.
+
+        Row k holds for the step from frame k to k + 1.
+        """
+        numbers = [getattr(self.materials[name], key) for name, _, key in (entry.partition(".") for entry in self.context)]
+        columns = [self.acceleration()] if self.container is not None else []
+        columns += [np.tile(numbers, (self.frames, 1))] if numbers else []
+        return np.concatenate(columns, 1).astype(np.float32) if columns else None
 
 
 class SceneFamily:
@@ -312,10 +423,20 @@ class SceneFamily:
                 raise InputError(where, "variant", variant, f"not among the variants {sorted(variants)}")
             content = _merged(content, variants[variant])
             content["name"] = f"{content.get('name')}-{variant}"
+        content, self.spreads = _without_spreads(content, where)
+        self.model = self._validated(content)
+        for (name, key), spread in self.spreads.items():
+            for value in {end for ranges in spread.values() for ends in ranges for end in ends}:
+                self._validated(_merged(content, {"materials": {name: {key: value}}}))
+        folder = Path(str(where)).parent
+        self._meshes = {index: obstacle.read(folder, where, f"obstacles[{index}]")
+                        for index, obstacle in enumerate(self.model.obstacles) if obstacle.kind == "mesh"}
+
+    def _validated(self, content: dict) -> _FamilyModel:
         try:
-            self.model = _FamilyModel.model_validate(content)
+            return _FamilyModel.model_validate(content)
         except ValidationError as error:
-            raise explain_validation(error, where) from None
+            raise explain_validation(error, self.where) from None
 
     @classmethod
     def load(cls, path: str | Path, variant: str | None = None) -> SceneFamily:
@@ -323,30 +444,59 @@ class SceneFamily:
         return cls(read_yaml(path), path, variant)
 
     def to_dict(self) -> dict:
-        return self.model.model_dump(mode="json")
+        content = self.model.model_dump(mode="json")
+        for (name, key), spread in self.spreads.items():
+            content["materials"][name][key] = {split: [list(ends) for ends in ranges] for split, ranges in spread.items()}
+        return content
 
-    def sample(self, seed: int) -> Scene:
-        """Draw one scene. Bodies are placed by rejection until they lie inside the box and apart from each other."""
+    def sample(self, seed: int, split: str = "train") -> Scene:
+        """Draw one scene of a split (they differ where a material number's ranges do). Bodies and obstacles are placed by rejection
+        until they lie inside the box and bodies apart from each other and from obstacles."""
         model = self.model
         rng = np.random.default_rng(np.random.SeedSequence([seed, 0]))
         shared = {name: getattr(model, name) for name in _Physics.model_fields}
+        # Streams of their own: a family that gains a range or a container keeps its bodies.
+        spread_rng = np.random.default_rng(np.random.SeedSequence([seed, 3]))
+        for (name, key), spread in self.spreads.items():
+            drawn = shared["materials"][name].model_copy(update={key: _draw(spread[split], spread_rng)})
+            shared["materials"] = shared["materials"] | {name: drawn}
+        if model.container is not None:
+            shared["container"] = model.container.draw(np.random.default_rng(np.random.SeedSequence([seed, 4])))
+        solids = [index for index, solid in enumerate(model.obstacles) for _ in range(int(rng.integers(solid.count[0], solid.count[1] + 1)))]
         chosen = [index for index, body in enumerate(model.bodies) for _ in range(int(rng.integers(body.count[0], body.count[1] + 1)))]
         if not chosen:
             chosen = [0]
         reason = ("bodies", "outside the box")
         for _ in range(_TRIES):
             bodies: list[Body] = []
+            obstacles, fault = self._obstacles(solids, rng)
+            if fault:
+                reason = fault
+                continue
             for index in chosen:
                 body = self._place(model.bodies[index], rng)
-                fault = self._fault(body, bodies)
+                fault = self._fault(body, bodies, obstacles)
                 if fault:
                     reason = (f"bodies[{index}]", fault)
                     break
                 bodies.append(body)
             else:
-                return Scene(seed=seed, bodies=bodies, **shared)
+                return Scene(seed=seed, bodies=bodies, obstacles=obstacles, **shared)
         remedy = f"{reason[1]} in each of {_TRIES} draws; make it smaller, move its center or allow fewer bodies"
         raise InputError(self.where, reason[0], f"seed {seed}", remedy)
+
+    def _obstacles(self, chosen: list[int], rng: np.random.Generator) -> tuple[list, tuple[str, str] | None]:
+        """Obstacles of the chosen families, or the first fault (key, why)."""
+        bounds = np.array(self.model.bounds)
+        placed = []
+        for index in chosen:
+            solid = self.model.obstacles[index]
+            obstacle = solid.place(bounds, rng, self._meshes[index]) if solid.kind == "mesh" else solid.place(bounds, rng)
+            fault = outside(obstacle, getattr(solid, "center", 0) is None and getattr(solid, "vertices", None) is None, bounds)
+            if fault:
+                return placed, (f"obstacles[{index}]", fault)
+            placed.append(obstacle)
+        return placed, None
 
     def _place(self, family: BodyFamily, rng: np.random.Generator) -> Body:
         model, shape, spacing = self.model, family.shape, self.model.spacing
@@ -373,7 +523,7 @@ class SceneFamily:
             return Body(center=center.tolist(), radius=radius, **common)
         return Body(vertices=(center + outline).tolist(), **common)
 
-    def _fault(self, body: Body, others: list[Body]) -> str | None:
+    def _fault(self, body: Body, others: list[Body], obstacles: list) -> str | None:
         model = self.model
         lower, upper = np.array(model.bounds).T
         low, high = body.extent()
@@ -385,6 +535,8 @@ class SceneFamily:
             raise InputError(self.where, "cells", model.cells, remedy)
         if not len(_cube_centers(body, model.spacing)):
             return "too thin to hold a particle"
+        if obstacles and combine(obstacles, _cube_centers(body, model.spacing))[0].min() < model.spacing / 2:
+            return "overlapping an obstacle"
         for other in others:
             other_low, other_high = other.extent()
             if (low < other_high + model.spacing).all() and (other_low < high + model.spacing).all():
@@ -400,6 +552,44 @@ def _cube_centers(body: Body, spacing: float) -> np.ndarray:
     start = (lower + upper) / 2 - counts * spacing / 2
     cubes = start + (np.stack(np.meshgrid(*[np.arange(c) for c in counts], indexing="ij"), -1).reshape(-1, len(counts)) + 0.5) * spacing
     return cubes[body.inside(cubes)]
+
+
+#: A material number of a family that varies: one range, several (drawn from in proportion to their widths), or those by split.
+_Ranges = tuple[Finite, Finite] | list[tuple[Finite, Finite]]
+_Spread = _Ranges | dict[Literal["train", "valid", "test"], _Ranges]
+
+
+def _without_spreads(content: dict, where: object) -> tuple[dict, dict[tuple[str, str], dict[str, list[tuple[float, float]]]]]:
+    """A family's content with one number in place of each varying one, and (material, key) -> split -> ranges."""
+    spreads = {}
+    materials = content.get("materials")
+    for name, material in (materials.items() if isinstance(materials, dict) else ()):
+        for key, value in (material.items() if isinstance(material, dict) else ()):
+            if not isinstance(value, (list, tuple, dict)):
+                continue
+            place = f"materials.{name}.{key}"
+            remedy = "must be a number, a range [low, high], several ranges, or those for each of train, valid, test"
+            try:
+                spread = TypeAdapter(_Spread).validate_python(value)
+            except ValidationError:
+                raise InputError(where, place, value, remedy) from None
+            by_split = spread if isinstance(spread, dict) else dict.fromkeys(SPLITS, spread)
+            by_split = {split: [ranges] if isinstance(ranges, tuple) else ranges for split, ranges in by_split.items()}
+            if set(by_split) != set(SPLITS) or not all(by_split.values()):
+                raise InputError(where, place, value, remedy)
+            if any(low > high for ranges in by_split.values() for low, high in ranges):
+                raise InputError(where, place, value, "low must not exceed high")
+            spreads[name, key] = by_split
+    for (name, key), spread in spreads.items():
+        content = _merged(content, {"materials": {name: {key: spread["train"][0][0]}}})
+    return content, spreads
+
+
+def _draw(ranges: list[tuple[float, float]], rng: np.random.Generator) -> float:
+    """Uniform over a union of ranges."""
+    widths = np.array([high - low for low, high in ranges])
+    shares = widths / widths.sum() if widths.sum() > 0 else np.full(len(ranges), 1 / len(ranges))
+    return float(rng.uniform(*ranges[int(rng.choice(len(ranges), p=shares))]))
 
 
 def _merged(base: dict, change: dict) -> dict:
@@ -448,7 +638,7 @@ def explain_validation(error: ValidationError, where: object) -> InputError:
     path, value, location = "", first["input"], first["loc"]
     for place, part in enumerate(location):
         # pydantic names the branch of a union after the key; that is not a key of the file.
-        tagged = place > 0 and (location[place - 1] == "shape" or (place == 2 and location[0] == "materials"))
+        tagged = place > 0 and (location[place - 1] == "shape" or (place == 2 and location[0] in ("materials", "obstacles")))
         branch = tagged or (place > 0 and (str(part) in ("float", "str", "constrained-float") or "[" in str(part)))
         if isinstance(part, int):
             path += f"[{part}]"

@@ -25,8 +25,9 @@ from sim.errors import InputError
 
 FORMAT_VERSION = 1
 
-#: Particle type ids as in DeepMind's released data (Sanchez-Gonzalez et al. 2020).
-PARTICLE_TYPES = {"rigid": 0, "boundary": 3, "water": 5, "sand": 6, "goop": 7}
+#: Particle type ids as in DeepMind's released data (Sanchez-Gonzalez et al. 2020), whose nine slots 0 .. 8 leave some free:
+#: elastic and snow are ours.
+PARTICLE_TYPES = {"rigid": 0, "elastic": 1, "boundary": 3, "water": 5, "sand": 6, "goop": 7, "snow": 8}
 KINEMATIC_TYPE = PARTICLE_TYPES["boundary"]
 
 

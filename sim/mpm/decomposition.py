@@ -20,6 +20,19 @@ def log1p(y):
 
 
 @ti.func
+def log1p_excess(y):
+    """y - log(1 + y), accurate near 0 in float32, where it is y^2 / 2: the first term of ``log1p``'s series drops out exactly."""
+    result = 0.0
+    if ti.abs(y) < 0.25:
+        z = y / (2.0 + y)
+        q = z * z
+        result = y * z - 2.0 * z * q * (1.0 / 3.0 + q * (0.2 + q * (1.0 / 7.0)))
+    else:
+        result = y - ti.log(1.0 + y)
+    return result
+
+
+@ti.func
 def expm1(y):
     """exp(y) - 1, accurate near 0 in float32: Taylor series to y^7 for |y| < 1/4 (error below 1e-9)."""
     result = 0.0
@@ -123,3 +136,39 @@ def pack2(M):
 def pack3(M):
     """Symmetric vector of a symmetric 3x3 matrix."""
     return ti.Vector([M[0, 0], M[1, 1], M[2, 2], M[1, 2], M[0, 2], M[0, 1]])
+
+
+@ti.func
+def unpack(s):
+    """Full matrix of a symmetric vector, 2D or 3D."""
+    if ti.static(s.n == 3):
+        return unpack2(s)
+    else:
+        return unpack3(s)
+
+
+@ti.func
+def pack(M):
+    """Symmetric vector of a symmetric matrix, 2D or 3D."""
+    if ti.static(M.n == 2):
+        return pack2(M)
+    else:
+        return pack3(M)
+
+
+@ti.func
+def decompose(s):
+    """Eigenvalues and frame of a symmetric vector, 2D or 3D; the frame is what ``assemble`` takes."""
+    if ti.static(s.n == 3):
+        return decompose2(s)
+    else:
+        return decompose3(s)
+
+
+@ti.func
+def assemble(values, frame):
+    """Symmetric vector with these eigenvalues in a frame of ``decompose``."""
+    if ti.static(values.n == 2):
+        return assemble2(values, frame)
+    else:
+        return assemble3(values, frame)

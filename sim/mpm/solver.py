@@ -5,17 +5,20 @@ Decisions, measured on a CPU:
   plain additions and the launch is paid once a frame; one thread per trajectory is bitwise reproducible;
 - numbers (sizes, materials, time step) are arguments and fields, structure (dimension, materials present, wall kind) is
   compiled in: scenes that differ in numbers share kernels;
-- on a GPU the same functions run as parallel loops, one kernel a substep.
+- on a GPU the same functions run as parallel loops, two kernels a substep.
 """
 
 import time
+from dataclasses import dataclass
 
 import numpy as np
 
 from sim.errors import InputError
 from sim.mpm.decomposition import finite
 from sim.mpm.materials import MODELS
-from sim.mpm.walls import wall
+from sim.mpm.rigid import RigidBodies, body_table
+from sim.mpm.walls import solid, wall
+from sim.obstacles import THINNEST, combine
 from sim.scene import Particles, Scene
 from sim.simulator import Kind, SimulationError, Start
 from sim.taichi_runtime import start_taichi, ti
@@ -24,6 +27,11 @@ from sim.taichi_runtime import start_taichi, ti
 WALL = 1
 #: A frame whose Courant number grew beyond this multiple of the requested one is taken back and repeated with half the step.
 COURANT_GROWTH = 1.5
+#: A particle alone on the grid is an oscillator: its stress turns its own velocity gradient about at w = 2 sqrt(dim) c / dx, and symplectic
+#: Euler needs w dt < 2, that is sqrt(dim) c dt < dx. Planned between the strong resonances of large swings, w dt = sqrt(2) and sqrt(3).
+#: Whole bodies bear more, so this binds at Courant numbers above 0.8 / sqrt(dim), where the volume of lone drops of water ran away.
+#: It is necessary, not sufficient: nothing damps a lone particle, and swings of 5 % may still grow until the trajectory fails.
+LONE_PARTICLE = 0.8
 #: Halvings of the planned step before a trajectory is given up.
 MAX_HALVINGS = 6
 
@@ -33,6 +41,22 @@ HAIR = 1e-4
 #: What a frame adds up: kinetic, potential, elastic energy; the largest of squared speed, wave speed, squared speed within the frame;
 #: particles that are not finite.
 SUMS = 7
+#: Friction coefficient that stands for ``sticky`` in the obstacles' field.
+STICKY = -1.0
+
+
+@dataclass(frozen=True)
+class Structure:
+    """What is compiled in. models: (material, *options) each; friction: the walls' "slip", "coulomb" or "sticky"; obstacles: "none",
+    "slip" or "coulomb" (which includes sticky ones); shaken: gravity changes from frame to frame; rigid: (bodies, faces of one) at most,
+    or None."""
+
+    dim: int
+    models: tuple
+    friction: str
+    obstacles: str = "none"
+    shaken: bool = False
+    rigid: tuple[int, int] | None = None
 
 
 def _power_of_two(n: int) -> int:
@@ -41,7 +65,7 @@ def _power_of_two(n: int) -> int:
 
 @ti.data_oriented
 class _Kernels:
-    """Fields and compiled code for one structure: dimension, materials present, wall kind; capacities in particles and nodes.
+    """Fields and compiled code for one ``Structure``; capacities in particles and nodes.
 
     Vectors that meet in the transfers have four equal lanes whatever the dimension: a node is (momentum, mass, 0), later (velocity, 1, 0);
     a particle's velocity carries the gathered 1 along. Uniform lanes are what the compiler turns into vector instructions; shorter
@@ -50,11 +74,15 @@ class _Kernels:
     Positions are stored in cells, from the padded corner.
     """
 
-    def __init__(self, dim: int, models: tuple, friction: str, capacity: int, nodes: tuple[int, ...], serial: bool):
-        self.dim, self.models, self.friction, self.capacity, self.nodes = dim, models, friction, capacity, nodes
+    def __init__(self, structure: Structure, capacity: int, nodes: tuple[int, ...], serial: bool):
+        self.structure, self.capacity, self.nodes = structure, capacity, nodes
+        dim, models = self.dim, self.models = structure.dim, structure.models
+        self.friction = structure.friction
         self.x = ti.Vector.field(dim, ti.f32, capacity)
         self.v = ti.Vector.field(4, ti.f32, capacity)
         self.C = [ti.Vector.field(4, ti.f32, capacity) for _ in range(dim)]  # column a: derivative of the velocity along axis a
+        #: Materials whose particles move with the grid.
+        self.flowing = [m for m, (model, *_) in enumerate(models) if model != "rigid"]
         self.materials = [MODELS[model](dim, capacity, *options) for model, *options in models]
         self.grid = ti.Vector.field(4, ti.f32, nodes)
         self.range = ti.field(ti.i32, len(models) + 1)  # particles of material m: range[m] .. range[m + 1]
@@ -62,12 +90,20 @@ class _Kernels:
         self.extent = ti.Vector.field(dim, ti.i32, 2)  # node indices of the walls
         self.dx, self.coefficient = ti.field(ti.f32, ()), ti.field(ti.f32, ())
         self.lower, self.gravity = ti.Vector.field(dim, ti.f32, ()), ti.Vector.field(dim, ti.f32, ())
+        #: Gravity as the box feels it in the current frame.
+        self.pull = ti.Vector.field(dim, ti.f32, ()) if structure.shaken else self.gravity
+        if structure.obstacles != "none":
+            self.solids = ti.Vector.field(dim + 2, ti.f32, nodes)  # normal, distance in cells, friction of the nearest obstacle
         self.E = ti.Vector.field(4, ti.f32, 3)
         self.state = [self.x, self.v, *self.C, *(field for material in self.materials for field in material.fields())]
         self.saved = [
             ti.field(ti.f32, capacity) if isinstance(field, ti.ScalarField) else ti.Vector.field(field.n, ti.f32, capacity) for field in self.state
         ]
-        self.frame = self.frame_serial if serial else self.frame_parallel
+        self.has_rigid = structure.rigid is not None
+        self.rigid = RigidBodies(self, *structure.rigid, capacity) if self.has_rigid else None
+        if self.has_rigid:
+            self.touched = ti.Vector.field(dim, ti.i32, 2)  # lowest and highest first node of a particle
+        self.frame = (self.frame_rigid if self.has_rigid else self.frame_serial) if serial else self.frame_parallel
 
     @ti.func
     def locate(self, x):
@@ -88,7 +124,7 @@ class _Kernels:
         factor = -4.0 * dt * volume / dx
         if ti.static(self.dim == 2):
             G = ti.Matrix.cols([ti.Vector([self.C[0][p][0], self.C[0][p][1]]), ti.Vector([self.C[1][p][0], self.C[1][p][1]])])
-            tau = factor * self.materials[m].kirchhoff(p, dt * G)
+            tau = factor * self.materials[m].kirchhoff(p, dt * G, dt)
             P0 = (mass * dx) * self.C[0][p] + tau[0, 0] * E0 + tau[1, 0] * E1
             P1 = (mass * dx) * self.C[1][p] + tau[0, 1] * E0 + tau[1, 1] * E1
             Q = mass * self.v[p] - fx[0] * P0 - fx[1] * P1
@@ -99,7 +135,7 @@ class _Kernels:
                     self.grid[base[0] + i, base[1] + j] += wy[j] * (R + float(j) * T)
         else:
             G = ti.Matrix.cols([ti.Vector([self.C[a][p][0], self.C[a][p][1], self.C[a][p][2]]) for a in ti.static(range(3))])
-            tau = factor * self.materials[m].kirchhoff(p, dt * G)
+            tau = factor * self.materials[m].kirchhoff(p, dt * G, dt)
             P0 = (mass * dx) * self.C[0][p] + tau[0, 0] * E0 + tau[1, 0] * E1 + tau[2, 0] * E2
             P1 = (mass * dx) * self.C[1][p] + tau[0, 1] * E0 + tau[1, 1] * E1 + tau[2, 1] * E2
             P2 = (mass * dx) * self.C[2][p] + tau[0, 2] * E0 + tau[1, 2] * E1 + tau[2, 2] * E2
@@ -115,17 +151,24 @@ class _Kernels:
 
     @ti.func
     def update_node(self, I, dt):
-        """Momentum to velocity, gravity, walls."""
+        """Momentum to velocity, gravity, walls, obstacles."""
         cell = self.grid[I]
         if cell[self.dim] > 0.0:
             inverse = 1.0 / cell[self.dim]
             v = ti.Vector.zero(ti.f32, self.dim)
             for d in ti.static(range(self.dim)):
-                v[d] = cell[d] * inverse + dt * self.gravity[None][d]
+                v[d] = cell[d] * inverse + dt * self.pull[None][d]
             # A name of its own: reassigning v from a function inside a branch is stored with its old value (Taichi 1.7.4).
             u = wall(v, I, self.extent[0], self.extent[1], self.friction, self.coefficient[None])
-            for d in ti.static(range(self.dim)):
-                cell[d] = u[d]
+            if ti.static(self.structure.obstacles != "none"):
+                w = solid(u, self.solids[I], self.structure.obstacles)
+                # The wall once more: an obstacle that leans on it must not push into it.
+                x = wall(w, I, self.extent[0], self.extent[1], self.friction, self.coefficient[None])
+                for d in ti.static(range(self.dim)):
+                    cell[d] = x[d]
+            else:
+                for d in ti.static(range(self.dim)):
+                    cell[d] = u[d]
             cell[self.dim] = 1.0
             self.grid[I] = cell
 
@@ -152,7 +195,7 @@ class _Kernels:
                 r0, r1 = self.grid[held][d] + 2.0 * self.grid[ghost][d], self.grid[inner][d] - self.grid[ghost][d]
                 free[d] = ((m1 + m) * r0 + 2.0 * m * r1) / det
                 fixed[d] = ((m0 + 4.0 * m) * r1 + 2.0 * m * r0) / det
-            fall = free + dt * self.gravity[None]
+            fall = free + dt * self.pull[None]
             u = wall(fall, held, self.extent[0], self.extent[1], self.friction, self.coefficient[None])
             for d in ti.static(range(self.dim)):
                 self.grid[held][d] = m0 * free[d]
@@ -247,7 +290,57 @@ class _Kernels:
                 v[d] = 0.0
             x[d] = inside
         self.x[p], self.v[p] = x, v
+        if ti.static(self.structure.obstacles != "none"):
+            self.push_out(p)
         return speed2
+
+    @ti.func
+    def clearance(self, x):
+        """Distance [cells] to the obstacles and unit normal at a place inside the box, multilinear in the nodes' values.
+
+        Between nodes the normals are averaged and stretched to length 1 again; on the middle line of a plate they cancel, and it stays 0.
+        """
+        low = ti.cast(x, ti.i32)
+        f = x - ti.cast(low, ti.f32)
+        normal, distance = ti.Vector.zero(ti.f32, self.dim), 0.0
+        for corner in ti.static(range(2**self.dim)):
+            at, weight = low, 1.0
+            for d in ti.static(range(self.dim)):
+                at[d] += ti.static(corner >> d & 1)
+                weight *= f[d] if ti.static(corner >> d & 1) else 1.0 - f[d]
+            value = self.solids[at]
+            distance += weight * value[self.dim]
+            for d in ti.static(range(self.dim)):
+                normal[d] += weight * value[d]
+        return distance, normal / ti.max(normal.norm(), 1e-6)
+
+    @ti.func
+    def push_out(self, p):
+        """A particle inside an obstacle goes back along the normal and meets the same condition as a node (``sim.mpm.walls.solid``).
+
+        Nodes outside stay free however near they are, so part of the reaction is missing on the grid; here it is made up, with its
+        friction. Twice, for a notch between two slopes.
+        """
+        for _ in ti.static(range(2)):
+            x = self.x[p]
+            distance, normal = self.clearance(x)
+            if distance < HAIR:
+                value, v = ti.Vector.zero(ti.f32, self.dim + 2), ti.Vector.zero(ti.f32, self.dim)
+                for d in ti.static(range(self.dim)):
+                    value[d], v[d] = normal[d], self.v[p][d]
+                value[self.dim + 1] = self.solids[ti.cast(x + 0.5, ti.i32)][self.dim + 1]
+                u = solid(v, value, self.structure.obstacles)
+                for d in ti.static(range(self.dim)):
+                    self.v[p][d] = u[d]
+                    moved = x[d] + (HAIR - distance) * normal[d]
+                    self.x[p][d] = ti.min(ti.max(moved, ti.cast(self.extent[0][d], ti.f32) + HAIR), ti.cast(self.extent[1][d], ti.f32) - HAIR)
+
+    @ti.func
+    def shake(self, sums: ti.template()):
+        """What bodies feel in a box of acceleration a is gravity - a; a stands behind the ``SUMS``."""
+        for _ in range(1):
+            for d in ti.static(range(self.dim)):
+                self.pull[None][d] = self.gravity[None][d] - ti.cast(sums[SUMS + d], ti.f32)
 
     @ti.func
     def report(self, m: ti.template(), p, position: ti.template(), sums: ti.template()):
@@ -259,6 +352,10 @@ class _Kernels:
             position[p, d] = x
             speed2 += self.v[p][d] ** 2
             height -= self.gravity[None][d] * x
+        if ti.static(self.models[m][0] == "rigid"):
+            # A body's inertia includes the splines' own moments; its energy does too.
+            for a in ti.static(range(self.dim)):
+                speed2 += 0.25 * (self.dx[None] * self.C[a][p]).norm_sqr()
         sums[0] += ti.cast(0.5 * mass * speed2, ti.f64)
         sums[1] += ti.cast(mass * height, ti.f64)
         sums[2] += ti.cast(volume * self.materials[m].energy_density(p), ti.f64)
@@ -269,65 +366,148 @@ class _Kernels:
             broken = broken or not finite(self.C[a][p].sum())
         sums[6] += ti.cast(broken, ti.f64)
 
+    @ti.func
+    def spread(self, dt):
+        """Particles to grid; returns the lowest and highest first node of a particle."""
+        low, high = ti.Vector([1 << 20] * self.dim), ti.Vector([0] * self.dim)
+        for m in ti.static(range(len(self.models))):
+            for p in range(self.range[m], self.range[m + 1]):
+                base, fx = self.locate(self.x[p])
+                low, high = ti.min(low, base), ti.max(high, base)
+                self.p2g(m, p, base, fx, dt)
+        return low, high
+
+    @ti.func
+    def clear(self, I):
+        self.grid[I] = ti.Vector.zero(ti.f32, 4)
+        if ti.static(self.has_rigid):
+            self.rigid.share[I] = ti.Vector.zero(ti.f32, 2)
+
+    @ti.func
+    def collect(self, low, high, dt):
+        """Nodes, walls and ghosts, then grid to particles; leaves the grid empty. Returns the largest squared speed."""
+        self.at_walls(low, high, dt, before=True)
+        if ti.static(self.dim == 2):
+            for i in range(low[0], high[0] + 3):
+                for j in range(low[1], high[1] + 3):
+                    self.update_node(ti.Vector([i, j]), dt)
+        else:
+            for i in range(low[0], high[0] + 3):
+                for j in range(low[1], high[1] + 3):
+                    for k in range(low[2], high[2] + 3):
+                        self.update_node(ti.Vector([i, j, k]), dt)
+        self.at_walls(low, high, dt, before=False)
+        fastest = 0.0
+        if ti.static(self.has_rigid):
+            for m in ti.static(self.flowing):
+                for p in range(self.range[m], self.range[m + 1]):
+                    fastest = ti.max(fastest, self.g2p(p, dt))
+        else:
+            for p in range(self.range[ti.static(len(self.models))]):
+                fastest = ti.max(fastest, self.g2p(p, dt))
+        if ti.static(self.dim == 2):
+            for i in range(low[0], high[0] + 3):
+                for j in range(low[1], high[1] + 3):
+                    self.clear(ti.Vector([i, j]))
+        else:
+            for i in range(low[0], high[0] + 3):
+                for j in range(low[1], high[1] + 3):
+                    for k in range(low[2], high[2] + 3):
+                        self.clear(ti.Vector([i, j, k]))
+        return fastest
+
     @ti.kernel
     def frame_serial(
         self, substeps: ti.i32, dt: ti.f32, keep: ti.i32, position: ti.types.ndarray(ti.f32, 2), sums: ti.types.ndarray(ti.f64, 1)
     ):
         """A whole frame; ``keep`` saves the state first. Only the box of nodes that particles touch is swept."""
+        if ti.static(self.structure.shaken):
+            self.shake(sums)
         ti.loop_config(serialize=True)
         for p in range(keep * self.range[ti.static(len(self.models))]):
             self.save_particle(p)
         ti.loop_config(serialize=True)
         for _ in range(substeps):
-            low, high = ti.Vector([1 << 20] * self.dim), ti.Vector([0] * self.dim)
-            for m in ti.static(range(len(self.models))):
-                for p in range(self.range[m], self.range[m + 1]):
-                    base, fx = self.locate(self.x[p])
-                    low, high = ti.min(low, base), ti.max(high, base)
-                    self.p2g(m, p, base, fx, dt)
-            self.at_walls(low, high, dt, before=True)
-            if ti.static(self.dim == 2):
-                for i in range(low[0], high[0] + 3):
-                    for j in range(low[1], high[1] + 3):
-                        self.update_node(ti.Vector([i, j]), dt)
-            else:
-                for i in range(low[0], high[0] + 3):
-                    for j in range(low[1], high[1] + 3):
-                        for k in range(low[2], high[2] + 3):
-                            self.update_node(ti.Vector([i, j, k]), dt)
-            self.at_walls(low, high, dt, before=False)
-            fastest = 0.0
-            for p in range(self.range[ti.static(len(self.models))]):
-                fastest = ti.max(fastest, self.g2p(p, dt))
-            sums[5] = ti.max(sums[5], ti.cast(fastest, ti.f64))
-            if ti.static(self.dim == 2):
-                for i in range(low[0], high[0] + 3):
-                    for j in range(low[1], high[1] + 3):
-                        self.grid[i, j] = ti.Vector.zero(ti.f32, 4)
-            else:
-                for i in range(low[0], high[0] + 3):
-                    for j in range(low[1], high[1] + 3):
-                        for k in range(low[2], high[2] + 3):
-                            self.grid[i, j, k] = ti.Vector.zero(ti.f32, 4)
+            low, high = self.spread(dt)
+            sums[5] = ti.max(sums[5], ti.cast(self.collect(low, high, dt), ti.f64))
         for m in ti.static(range(len(self.models))):
             ti.loop_config(serialize=True)
             for p in range(self.range[m], self.range[m + 1]):
                 self.report(m, p, position, sums)
 
-    def frame_parallel(self, substeps, dt, keep, position, sums) -> None:
-        """The same, one kernel a substep, all loops parallel (for a GPU)."""
+    def frame_rigid(self, substeps, dt, keep, position, sums) -> None:
+        """The same with rigid bodies, in five kernels a substep: all in one took 18 s to compile."""
         if keep:
             self.save()
+            self.keep_rigid(False)
         for _ in range(substeps):
-            self.substep_parallel(dt, sums)
+            self.spread_serial(dt, sums)
+            self.step_rigid(dt, sums)
+            self.collect_serial(dt, sums)
         self.report_parallel(position, sums)
 
     @ti.kernel
-    def substep_parallel(self, dt: ti.f32, sums: ti.types.ndarray(ti.f64, 1)):
+    def spread_serial(self, dt: ti.f32, sums: ti.types.ndarray(ti.f64, 1)):
+        if ti.static(self.structure.shaken):
+            self.shake(sums)
+        ti.loop_config(serialize=True)
+        for _ in range(1):
+            self.touched[0], self.touched[1] = self.spread(dt)
+
+    @ti.kernel
+    def meet_rigid(self, dt: ti.f32):
+        """Bodies read the grid before walls and obstacles change it: these act on the bodies themselves. One thread, here and below."""
+        ti.loop_config(serialize=True)
+        for _ in range(1):
+            self.rigid.meet(dt)
+
+    @ti.kernel
+    def solve_rigid(self):
+        ti.loop_config(serialize=True)
+        for _ in range(1):
+            self.rigid.solve()
+
+    @ti.kernel
+    def move_rigid(self, dt: ti.f32, sums: ti.types.ndarray(ti.f64, 1)):
+        ti.loop_config(serialize=True)
+        for _ in range(1):
+            sums[5] = ti.max(sums[5], ti.cast(self.rigid.advance(dt), ti.f64))
+
+    def step_rigid(self, dt, sums) -> None:
+        self.meet_rigid(dt)
+        self.solve_rigid()
+        self.move_rigid(dt, sums)
+
+    @ti.kernel
+    def collect_serial(self, dt: ti.f32, sums: ti.types.ndarray(ti.f64, 1)):
+        ti.loop_config(serialize=True)
+        for _ in range(1):
+            sums[5] = ti.max(sums[5], ti.cast(self.collect(self.touched[0], self.touched[1], dt), ti.f64))
+
+    def frame_parallel(self, substeps, dt, keep, position, sums) -> None:
+        """The same, two kernels a substep (five with rigid bodies), all loops parallel (for a GPU)."""
+        if keep:
+            self.save()
+            if self.has_rigid:
+                self.keep_rigid(False)
+        for _ in range(substeps):
+            self.spread_parallel(dt, sums)
+            if self.has_rigid:
+                self.step_rigid(dt, sums)
+            self.collect_parallel(dt, sums)
+        self.report_parallel(position, sums)
+
+    @ti.kernel
+    def spread_parallel(self, dt: ti.f32, sums: ti.types.ndarray(ti.f64, 1)):
+        if ti.static(self.structure.shaken):
+            self.shake(sums)
         for m in ti.static(range(len(self.models))):
             for p in range(self.range[m], self.range[m + 1]):
                 base, fx = self.locate(self.x[p])
                 self.p2g(m, p, base, fx, dt)
+
+    @ti.kernel
+    def collect_parallel(self, dt: ti.f32, sums: ti.types.ndarray(ti.f64, 1)):
         for axis in ti.static(range(self.dim)):
             for I in ti.grouped(self.grid):
                 if I[axis] < 2:
@@ -338,10 +518,11 @@ class _Kernels:
             for I in ti.grouped(self.grid):
                 if I[axis] < 2:
                     self.ghost(axis, I[axis], I, dt, False)
-        for p in range(self.range[ti.static(len(self.models))]):
-            ti.atomic_max(sums[5], ti.cast(self.g2p(p, dt), ti.f64))
+        for m in ti.static(self.flowing):
+            for p in range(self.range[m], self.range[m + 1]):
+                ti.atomic_max(sums[5], ti.cast(self.g2p(p, dt), ti.f64))
         for I in ti.grouped(self.grid):
-            self.grid[I] = ti.Vector.zero(ti.f32, 4)
+            self.clear(I)
 
     @ti.kernel
     def report_parallel(self, position: ti.types.ndarray(ti.f32, 2), sums: ti.types.ndarray(ti.f64, 1)):
@@ -378,7 +559,29 @@ class _Kernels:
                 self.v[p][self.dim] = 1.0
                 self.materials[m].reset(p)
         for I in ti.grouped(self.grid):
-            self.grid[I] = ti.Vector.zero(ti.f32, 4)
+            self.clear(I)
+
+    @ti.kernel
+    def load_rigid(self, table: ti.types.ndarray(ti.f64, 2)):
+        for _ in range(1):
+            self.rigid.load(table)
+            for b in range(self.rigid.count[None]):
+                self.rigid.write(b)
+
+    @ti.kernel
+    def keep_rigid(self, back: ti.template()):
+        for _ in range(1):
+            self.rigid.keep(back)
+
+    @ti.kernel
+    def load_solids(self, values: ti.types.ndarray(ti.f32, 2)):
+        """[nodes, dim + 2] in the order of the grid's indices."""
+        for I in ti.grouped(self.solids):
+            row = 0
+            for d in ti.static(range(self.dim)):
+                row = row * ti.static(self.nodes[d]) + I[d]
+            for lane in ti.static(range(self.dim + 2)):
+                self.solids[I][lane] = values[row, lane]
 
     @ti.func
     def save_particle(self, p):
@@ -396,7 +599,12 @@ class _Kernels:
             for f in ti.static(range(len(self.state))):
                 self.state[f][p] = self.saved[f][p]
         for I in ti.grouped(self.grid):
-            self.grid[I] = ti.Vector.zero(ti.f32, 4)
+            self.clear(I)
+
+
+def _frictions(scene: Scene) -> list:
+    """Of each obstacle; the walls' unless it has its own."""
+    return [scene.walls.friction if obstacle.friction is None else obstacle.friction for obstacle in scene.obstacles]
 
 
 class MPMSimulator:
@@ -431,8 +639,8 @@ class MPMSimulator:
         structure, nodes = self._structure(scene), tuple(int(c) + 2 * WALL + 1 for c in self._cells(scene))
         capacity = _power_of_two(len(particles.position))
         old, fresh = self._kernels, False
-        if old is None or (old.dim, old.models, old.friction) != structure or old.nodes != nodes or old.capacity < capacity:
-            self._kernels, fresh = _Kernels(*structure, capacity, nodes, serial), True
+        if old is None or old.structure != structure or old.nodes != nodes or old.capacity < capacity:
+            self._kernels, fresh = _Kernels(structure, capacity, nodes, serial), True
         kernels = self._kernels
         lower, upper = np.array(scene.bounds).T
         cells = self._cells(scene)
@@ -441,21 +649,33 @@ class MPMSimulator:
         position = particles.position
         if self.settings["perturbation"]:
             noise = np.random.default_rng(np.random.SeedSequence([scene.seed, 2])).normal(size=position.shape)
+            for index, body in enumerate(scene.bodies):
+                if scene.materials[body.material].model == "rigid":
+                    noise[particles.body == index] = noise[particles.body == index][:1]
             position = position + self.settings["perturbation"] * noise
         # Where a wall stops particles during the run, it also holds the start.
         cell = np.clip((position - lower) / self.dx + WALL, WALL + HAIR, WALL + cells - HAIR)
         data = np.ascontiguousarray(np.concatenate([cell, particles.velocity], 1).astype(np.float32))
         kernels.load(data, self._table(scene, particles, cells))
-        self._cfl = self.settings["cfl"] or scene.cfl
+        if structure.obstacles != "none":
+            kernels.load_solids(self._solids(scene, nodes))
+        if structure.rigid:
+            kernels.load_rigid(body_table(scene, particles, data[:, : scene.dim].astype(float), self.dx, WALL, structure.rigid[1]))
+        self._acceleration, self._frame, self._boundary = scene.acceleration(), 0, scene.boundary.astype(np.float32)
+        self._cfl, self._least = self.settings["cfl"] or scene.cfl, self._fewest(scene, self.dx)
+        self._rings = self._ringing(scene, self.dx, 1.0) > 0
         self._position = np.zeros((len(position), scene.dim), np.float32)
+        if fresh:
+            # Compiles all that a frame needs; the tiny step is taken back.
+            self._run(int(kernels.has_rigid), 1e-9, keep=True)
+            self._restore()
         self._run(0, 0.0, keep=True)
         if fresh:
-            kernels.restore()
             self.compile_seconds += time.perf_counter() - begun
 
     def _table(self, scene: Scene, particles: Particles, cells: np.ndarray) -> np.ndarray:
-        """All numbers of a scene that kernels need, [6 + materials, 8] float32, a row a thing."""
-        table = np.zeros((6 + len(scene.materials), 8))
+        """All numbers of a scene that kernels need, [6 + materials, 12] float32, a row a thing."""
+        table = np.zeros((6 + len(scene.materials), 12))
         dim, friction, volume = scene.dim, scene.walls.friction, particles.spacing**scene.dim
         table[0, :2] = self.dx, 0.0 if friction == "sticky" else friction
         table[1, :dim], table[2, :dim] = np.array(scene.bounds)[:, 0], scene.gravity
@@ -467,6 +687,14 @@ class MPMSimulator:
             table[row, : 3 + len(numbers)] = end, material.density * volume, volume, *numbers
         return table.astype(np.float32)
 
+    def _solids(self, scene: Scene, nodes: tuple[int, ...]) -> np.ndarray:
+        """Normal, distance [cells] and friction of the obstacles at each node, [nodes, dim + 2] float32."""
+        lower = np.array(scene.bounds)[:, 0]
+        at = lower + (np.stack(np.meshgrid(*[np.arange(n) for n in nodes], indexing="ij"), -1).reshape(-1, scene.dim) - WALL) * self.dx
+        distance, normal, nearest = combine(scene.obstacles, at)
+        friction = np.array([STICKY if kind == "sticky" else kind for kind in _frictions(scene)])[nearest]
+        return np.concatenate([normal, distance[:, None] / self.dx, friction[:, None]], 1).astype(np.float32)
+
     def _refine(self, scene: Scene) -> int:
         return scene.refine if self.settings["particles"] == "teacher" else 1
 
@@ -477,13 +705,34 @@ class MPMSimulator:
         edges = (upper - lower) / cells
         if np.ptp(edges) > 1e-6 * edges[0]:
             raise InputError(scene.name, "coarsen", self.settings["coarsen"], f"does not divide the box's cells {scene.cells} alike")
+        for index, obstacle in enumerate(scene.obstacles):
+            thickness = getattr(obstacle, "thickness", np.inf)
+            if thickness < THINNEST * edges[0] * (1 - 1e-9):
+                remedy = f"thinner than {THINNEST:g} grid cells of {edges[0]:.4g}, so that particles leak through; thicken it or refine the grid"
+                raise InputError(scene.name, f"obstacles[{index}].thickness", thickness, remedy)
         return cells
 
-    def _structure(self, scene: Scene) -> tuple[int, tuple, str]:
-        """What is compiled in: dimension, materials with their options, wall kind."""
+    def _structure(self, scene: Scene) -> Structure:
         models = tuple((material.model, *MODELS[material.model].options(material)) for material in scene.materials.values())
         friction = scene.walls.friction
-        return scene.dim, models, "sticky" if friction == "sticky" else "coulomb" if friction > 0 else "slip"
+        walls = "sticky" if friction == "sticky" else "coulomb" if friction > 0 else "slip"
+        obstacles = "none" if not scene.obstacles else "slip" if all(kind == 0 for kind in _frictions(scene)) else "coulomb"
+        rigid = [body for body in scene.bodies if scene.materials[body.material].model == "rigid"]
+        faces = max((len(body.vertices) if body.vertices else 6 for body in rigid), default=0)
+        # Rounded up, so that scenes of a family share their kernels.
+        limits = (_power_of_two(len(rigid)), 6 if faces <= 6 else _power_of_two(faces)) if rigid else None
+        return Structure(scene.dim, models, walls, obstacles, scene.container is not None, limits)
+
+    def _fewest(self, scene: Scene, dx: float) -> int:
+        """Substeps a frame that the materials' own bounds ask for."""
+        step = min(MODELS[material.model].largest_step(material, scene.dim, dx) for material in scene.materials.values())
+        return max(1, int(np.ceil(scene.frame_step / step)))
+
+    def _ringing(self, scene: Scene, dx: float, wave_speed: float) -> int:
+        """Substeps a frame that a lone particle asks for (``LONE_PARTICLE``); none where every material goes slack when it is parted."""
+        if not any(MODELS[material.model].rings(material) for material in scene.materials.values()):
+            return 0
+        return int(np.ceil(scene.frame_step * wave_speed * np.sqrt(scene.dim) / (LONE_PARTICLE * dx)))
 
     def plan(self, scene: Scene) -> dict:
         """What ``load`` would build for a scene, without building it.
@@ -491,40 +740,61 @@ class MPMSimulator:
         kernels: names; fields: name -> [bytes an entry, entries]; left_out: name -> reason; bytes; particles; recorded; cells;
         substeps_per_frame: (at rest, at the speed of a fall through the whole box).
         """
-        dim, models, friction = self._structure(scene)
+        structure = self._structure(scene)
+        dim, models, friction = structure.dim, structure.models, structure.friction
         particles, cells = scene.particles(self._refine(scene)), self._cells(scene)
         lower, upper = np.array(scene.bounds).T
         dx = float((upper[0] - lower[0]) / cells[0])
         n, nodes = _power_of_two(len(particles.position)), int(np.prod(cells + 2 * WALL + 1))
         particle_fields = {"x": dim, "v": 4, **{f"C{axis}": 4 for axis in range(dim)}}
         left_out = {"third dimension": "a 2D scene"} if dim == 2 else {}
-        for name, *_ in models:
-            particle_fields |= {f"{name}.{field}": width for field, width in MODELS[name].state(dim).items()}
-            left_out |= MODELS[name].left_out
+        for name, material in scene.materials.items():
+            model = MODELS[material.model]
+            particle_fields |= {f"{name}.{field}": width for field, width in model.state(dim).items()}
+            left_out |= {f"{what} of {name}": reason for what, reason in (model.left_out | model.omissions(material)).items()}
         if len(models) == 1:
             left_out["material of a particle"] = "one material"
-        left_out["signed distance"] = "no obstacles"
-        left_out["context"] = "no moving container, no varying parameter"
+        kernels = ["load", "restore", "frame_serial"]
+        if structure.obstacles == "none":
+            left_out["signed distance"] = "no obstacles"
+        if not structure.shaken:
+            left_out["changing gravity"] = "the container stands still"
+        if structure.obstacles == "slip":
+            left_out["obstacle friction"] = "slip obstacles"
+        context = scene.context_values()
+        if context is None:
+            left_out["context"] = "no moving container, no varying parameter"
         if friction == "slip":
             left_out["wall friction"] = "slip walls"
         fields = {name: (4 * width, n) for name, width in particle_fields.items()}
         fields |= {f"saved {name}": entry for name, entry in fields.items()}
         fields["grid"] = (16, nodes)
+        if structure.obstacles != "none":
+            fields["signed distance"] = (4 * (dim + 2), nodes)
+            kernels.append("load_solids")
+        if structure.rigid is None:
+            left_out["rigid bodies"] = "none in the scene"
+        else:
+            fields |= RigidBodies.sizes(dim, *structure.rigid, n, nodes)
+            kernels[2:] = ["save", "spread_serial", "meet_rigid", "solve_rigid", "move_rigid", "collect_serial", "report_parallel", "load_rigid",
+                           "keep_rigid"]
         speeds = [MODELS[material.model].rest_wave_speed(material, self.settings["stiffness"]) for material in scene.materials.values()]
-        gravity = float(np.linalg.norm(scene.gravity))
+        gravity = float(np.linalg.norm(np.array(scene.gravity) - scene.acceleration(), axis=1).max())
         start = float(np.sqrt((particles.velocity**2).sum(1).max()))
         fall = float(np.sqrt(start**2 + 2 * gravity * np.linalg.norm(upper - lower)))
-        limit = (self.settings["cfl"] or scene.cfl) * dx
-        substeps = [max(1, int(np.ceil(scene.frame_step * (max(speeds) + v + gravity * scene.frame_step) / limit))) for v in (0.0, fall)]
+        limit, fewest = (self.settings["cfl"] or scene.cfl) * dx, self._fewest(scene, dx)
+        fewest = max(fewest, self._ringing(scene, dx, max(speeds)))
+        substeps = [max(fewest, int(np.ceil(scene.frame_step * (max(speeds) + v + gravity * scene.frame_step) / limit))) for v in (0.0, fall)]
         return {
-            "dim": dim, "materials": [name for name, *_ in models], "walls": friction, "kernels": ["load", "restore", "frame_serial"],
-            "fields": fields, "left_out": left_out, "bytes": sum(size * count for size, count in fields.values()),
-            "particles": len(particles.position), "recorded": len(particles.tracked), "cells": cells.tolist(), "grid_spacing": dx,
-            "wave_speed": max(speeds), "substeps_per_frame": substeps,
+            "dim": dim, "materials": [name for name, *_ in models], "walls": friction, "obstacles": len(scene.obstacles),
+            "context": 0 if context is None else context.shape[1], "kernels": kernels, "fields": fields, "left_out": left_out,
+            "bytes": sum(size * count for size, count in fields.values()), "particles": len(particles.position),
+            "recorded": len(particles.tracked) + len(scene.boundary), "kinematic": len(scene.boundary), "cells": cells.tolist(),
+            "grid_spacing": dx, "wave_speed": max(speeds), "substeps_per_frame": substeps,
         }
 
     def _run(self, substeps: int, dt: float, keep: bool) -> np.ndarray:
-        sums = np.zeros(SUMS)
+        sums = np.concatenate([np.zeros(SUMS), self._acceleration[min(self._frame, len(self._acceleration) - 1)]])
         self._kernels.frame(substeps, dt, int(keep), self._position, sums)
         kinetic, potential, elastic = sums[:3].tolist()
         self._diagnostics = {
@@ -534,25 +804,58 @@ class MPMSimulator:
         return sums
 
     def frame(self) -> np.ndarray:
-        """Advance one frame; positions of the recorded particles, [n, dim] float32. Raises ``SimulationError``.
+        """Advance one frame; positions of the recorded particles, kinematic ones last, [n, dim] float32. Raises ``SimulationError``.
 
-        dt <= cfl dx / (c + |v|) with the current wave speed and the speed that gravity can add within the frame; substeps
-        divide the frame exactly. A frame whose Courant number outgrew the plan is taken back and repeated with half the step.
+        dt <= cfl dx / (c + |v|) with the current wave speed and the speed that gravity can add within the frame, and the bounds of a
+        lone particle and of the materials (viscosity); substeps divide the frame exactly. A frame whose Courant number outgrew the
+        plan is taken back and repeated with half the step.
         """
-        kernels, scene, known = self._kernels, self._scene, self._diagnostics
-        reach = float(np.linalg.norm(scene.gravity)) * scene.frame_step
-        substeps = max(1, int(np.ceil(scene.frame_step * (known["wave_speed"] + known["max_speed"] + reach) / (self._cfl * self.dx))))
+        scene, known = self._scene, self._diagnostics
+        felt = scene.gravity - self._acceleration[min(self._frame, len(self._acceleration) - 1)]
+        reach = float(np.linalg.norm(felt)) * scene.frame_step
+        courant = int(np.ceil(scene.frame_step * (known["wave_speed"] + known["max_speed"] + reach) / (self._cfl * self.dx)))
+        substeps = max(self._least, courant, self._ringing(scene, self.dx, known["wave_speed"]))
         for attempt in range(MAX_HALVINGS + 1):
             dt = scene.frame_step / substeps
             sums = self._run(substeps, dt, keep=attempt == 0)
             if np.isfinite(sums).all() and sums[6] == 0:
                 speed = float(np.sqrt(max(sums[3], sums[5])))
-                if dt * (speed + sums[4]) <= COURANT_GROWTH * self._cfl * self.dx and dt * speed <= self.dx:
-                    return self._position[self._tracked]
+                ring = self._rings and dt * sums[4] * np.sqrt(scene.dim) > self.dx
+                if dt * (speed + sums[4]) <= COURANT_GROWTH * self._cfl * self.dx and dt * speed <= self.dx and not ring:
+                    self._frame += 1
+                    return np.concatenate([self._position[self._tracked], self._boundary])
             if attempt < MAX_HALVINGS:
-                kernels.restore()
+                self._restore()
                 substeps *= 2
         raise SimulationError(f"time step fell below {dt:.3g} s without a finite, stable frame")
+
+    def _restore(self) -> None:
+        self._kernels.restore()
+        if self._kernels.has_rigid:
+            self._kernels.keep_rigid(True)
+
+    def state(self) -> dict[str, np.ndarray]:
+        """All simulated particles, in float64: ``position`` [length], ``velocity`` [length/s], [n, dim] each, ``velocity gradient`` [1/s]
+        [n, dim, dim], and what materials carry, named as in ``plan``: [particles of that material] or [particles of that material, floats]."""
+        kernels, scene, n = self._kernels, self._scene, len(self._position)
+        lower, ends = np.array(scene.bounds)[:, 0], kernels.range.to_numpy()
+        found = {"position": lower + (kernels.x.to_numpy()[:n].astype(float) - WALL) * self.dx}
+        found["velocity"] = kernels.v.to_numpy()[:n, : scene.dim].astype(float)
+        found["velocity gradient"] = np.stack([column.to_numpy()[:n, : scene.dim] for column in kernels.C], -1).astype(float)
+        for m, ((name, material), model) in enumerate(zip(scene.materials.items(), kernels.materials, strict=True)):
+            for key, field in zip(MODELS[material.model].state(scene.dim), model.fields(), strict=True):
+                found[f"{name}.{key}"] = field.to_numpy()[ends[m] : ends[m + 1]].astype(float)
+        return found
+
+    def set_velocity(self, velocity: np.ndarray) -> None:
+        """Replace the velocities [n, dim] of all particles; affine parts become zero. For starts that no scene describes."""
+        kernels, (n, dim) = self._kernels, velocity.shape
+        lanes = np.zeros((kernels.capacity, 4), np.float32)
+        for column in kernels.C:
+            column.from_numpy(lanes)
+        lanes[:n, :dim], lanes[:n, dim] = velocity, 1.0
+        kernels.v.from_numpy(lanes)
+        self._run(0, 0.0, keep=True)
 
     def diagnostics(self) -> dict[str, float]:
         """Energies [J per unit depth in 2D], max speed and wave speed [m/s], substeps and dt [s] of the current frame."""

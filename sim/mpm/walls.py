@@ -1,4 +1,4 @@
-"""Walls of the container as a condition on grid nodes."""
+"""Walls of the container and obstacles as conditions on grid nodes."""
 
 from sim.taichi_runtime import ti
 
@@ -23,4 +23,24 @@ def wall(v, node, low, high, friction: ti.template(), coefficient):
                     if ti.static(friction == "coulomb"):
                         speed = v.norm()
                         v *= ti.max(0.0, 1.0 - coefficient * ti.abs(normal) / ti.max(speed, 1e-12))
+    return v
+
+
+@ti.func
+def solid(v, value, friction: ti.template()):
+    """Velocity of a grid node in or on an obstacle; ``value`` is (normal [dim], distance, friction), friction < 0 is sticky.
+
+    As at a wall: no velocity into the solid, Coulomb friction on the rest, free to leave. ``friction``: "slip" or "coulomb".
+    """
+    if value[v.n] <= 0.0:
+        normal = ti.Vector([value[d] for d in ti.static(range(v.n))])
+        approach = v.dot(normal)
+        if ti.static(friction == "coulomb"):
+            if value[v.n + 1] < 0.0:
+                v = v * 0.0
+            elif approach < 0.0:
+                along = v - approach * normal
+                v = along * ti.max(0.0, 1.0 + value[v.n + 1] * approach / ti.max(along.norm(), 1e-12))
+        elif approach < 0.0:
+            v -= approach * normal
     return v

@@ -236,6 +236,20 @@ def test_columns_of_sand_collapse_and_come_to_rest(sand):
     assert runouts[0] > 1.2 * runouts[1], runouts
 
 
+def test_frictionless_sand_levels_out_and_steep_sand_stands(sand):
+    """phi = 0 is a liquid: half of what a column can release is gone, and its surface is flat; phi = 80 stands as a wall, as no 35 does."""
+    tops = {}
+    for phi in (0.0, 35.0, 80.0):
+        sand.load(scene(SAND | {"friction_angle": phi}, [box([0.875, 0.0], [1.125, 0.25])], **WIDE, walls={"friction": 0.7}))
+        for _ in range(200):
+            last = sand.frame()
+        heights = [last[np.abs(last[:, 0] - at) < 0.0625, 1] for at in (0.4, 1.0, 1.6)]
+        tops[phi] = [each.max() if len(each) else 0.0 for each in heights]
+    assert max(tops[0.0]) < 0.08, "an eighth of a box is 1/16 of WIDE, level to a cell"
+    assert tops[80.0][1] > 0.22 and tops[35.0][1] < 0.2
+    assert tops[80.0][0] == tops[80.0][2] == 0.0
+
+
 @pytest.mark.parametrize("mu", [0.15, 0.3])
 def test_sand_slides_with_coulomb_friction(sand, mu):
     """A low block, thrown along the floor: deceleration mu g for mu below tan phi.

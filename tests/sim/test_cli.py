@@ -103,6 +103,17 @@ def test_mistakes_exit_with_2_and_write_nothing(scene, tmp_path, capsys, change,
     assert not (tmp_path / "data").exists()
 
 
+def test_what_exceeds_the_budget_is_refused_before_the_run(scene, tmp_path, capsys):
+    content = json.loads(scene.read_text())
+    name, material = next(iter(content["materials"].items()))
+    scene.write_text(json.dumps(content | {"materials": {name: material | {"sound_speed": 1e7}}}))
+    assert run("generate", scene, "--out", tmp_path / "data", "--budget", "0.5") == 2
+    said = one_line(capsys)
+    assert "hours of one core" in said and "wave speed 1e+07 m/s" in said and "raise --budget" in said
+    assert not (tmp_path / "data").exists()
+    assert run("generate", scene, "--out", tmp_path / "data", "--budget", "1e9") == 0
+
+
 @pytest.mark.parametrize("arguments", ["", "generate", "generate a.yaml --out x --jobs 0", "paint", "plan a --frames 1"])
 def test_usage_exits_with_2(arguments):
     with pytest.raises(SystemExit) as caught:

@@ -78,6 +78,28 @@ def test_a_run_builds_and_costs_what_the_plan_says(material, built):
     assert substeps.mean() == pytest.approx(np.mean(promised["substeps_per_frame"]), rel=0.3)
 
 
+PARTS = {
+    "obstacles": {"obstacles": [{"kind": "ball", "radius": 0.1, "count": [1, 1], "center": [0.2, 0.2]}]},
+    "container": {"container": {"amplitude": [[1.0, 2.0], 0.0], "frequency": 1.0}},
+    "rigid": {"materials": {"water": MATERIALS["water"], "box": {"model": "rigid", "density": 500.0}},
+              "bodies": [{"material": "water", "shape": {"kind": "box", "size": [0.4, 0.3]}},
+                         {"material": "box", "shape": {"kind": "box", "size": [0.2, 0.1]}}]},
+}
+
+
+@pytest.mark.parametrize("part", PARTS)
+def test_parts_of_a_scene_build_what_the_plan_says(part, built):
+    from sim.mpm.solver import MPMSimulator
+
+    scene = family("water", frames=3, **PARTS[part]).sample(0)
+    promised = MPMSimulator().plan(scene)
+    assert simulate(MPMSimulator(), scene).ok
+    assert Counter(field for field in built["fields"] if field[1] > 8) == Counter(map(tuple, promised["fields"].values()))
+    assert built["kernels"] == set(promised["kernels"])
+    bare = MPMSimulator().plan(family("water", frames=3).sample(0))
+    assert set(promised["left_out"]) < set(bare["left_out"]) | {"deformation of rigid bodies"}
+
+
 def test_what_a_scene_does_not_need_is_left_out():
     water, sand = plan(family("water")).solver, plan(family("sand", walls={"friction": 0.4})).solver
     assert "water.J" in water["fields"] and not any("sand" in name for name in water["fields"])

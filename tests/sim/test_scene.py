@@ -143,6 +143,8 @@ def test_types_and_velocities_follow_the_bodies():
     assert (kinds[moving] == PARTICLE_TYPES["sand"]).all() and (particles.velocity[~moving] == 0).all()
 
 
+SAND = {"model": "sand", "young_modulus": 1e5, "friction_angle": 30}
+GOOP = {"model": "goop", "young_modulus": 1e5, "yield_stress": 10}
 MISTAKES = {
     "unknown key": ({"colour": "blue"}, "colour = 'blue': unknown key"),
     "wrong type": ({"frames": "many"}, "frames = 'many'"),
@@ -159,6 +161,14 @@ MISTAKES = {
     "reversed range": ({"bodies": [{"material": "water", "shape": {"kind": "ball", "radius": [0.2, 0.1]}}]}, "bodies\\[0\\].shape.radius"),
     "unknown shape": ({"bodies": [{"material": "water", "shape": {"kind": "torus"}}]}, "bodies\\[0\\].shape"),
     "liquid sand": ({"materials": {"sand": {"model": "sand", "young_modulus": 1e5, "friction_angle": 90}}}, "materials.sand.friction_angle = 90"),
+    "steep sand": ({"materials": {"sand": SAND | {"friction_angle": 90}}}, "materials.sand.friction_angle = 90.0: must lie"),
+    "sticky liquid": ({"materials": {"sand": SAND | {"friction_angle": 0, "cohesion": 10}}}, "materials.sand.cohesion = 10.0: needs"),
+    "incompressible": ({"materials": {"goop": GOOP | {"poisson_ratio": 0.5}}}, "materials.goop.poisson_ratio = 0.5: must lie in 0 .. 0.4999"),
+    "negative yield": ({"materials": {"goop": GOOP | {"yield_stress": -1}}}, "materials.goop.yield_stress = -1.0: must not"),
+    "infinite yield": ({"materials": {"goop": GOOP | {"yield_stress": float("inf")}}}, "materials.goop.yield_stress = inf"),
+    "negative viscosity": ({"materials": {"water": {"model": "water", "sound_speed": 5, "viscosity": -0.1}}}, "materials.water.viscosity = -0.1"),
+    "no stretch": ({"materials": {"snow": {"model": "snow", "critical_stretch": 0}}}, "materials.snow.critical_stretch = 0"),
+    "soft rubber": ({"materials": {"rubber": {"model": "elastic", "young_modulus": 0}}}, "materials.rubber.young_modulus = 0"),
     "huge grid": ({"cells": [10**6, 10**6]}, "cells\\[0\\] = 1000000"),
 }
 

@@ -11,15 +11,16 @@ class WaterModel:
     """Tait pressure p = B (J^-gamma - 1), B = rho0 c^2 / gamma (Monaghan 1994, eq. 3), tau = -J p I; J <- J (1 + dt tr grad v).
 
     J may exceed 1: water then pulls, by less than B. Holding J at 1 was tried and loses the record of how far particles have
-    parted; a settled drop ended a third too high.
+    parted; a settled drop ended a third too high. With a viscosity eta, tau += 2 eta dev(sym grad v): the kinematic viscosity
+    eta / rho0 stays the same as J changes, and with it the bound on the time step.
     """
 
     left_out = {"F": "water needs only the volume ratio J", "decomposition": "no shear, so no principal directions"}
 
-    def __init__(self, dim: int, capacity: int, seven: bool):
-        self.dim, self.seven = dim, seven
+    def __init__(self, dim: int, capacity: int, seven: bool, viscous: bool):
+        self.dim, self.seven, self.viscous = dim, seven, viscous
         self.J = ti.field(ti.f32, capacity)
-        self.parameters = ti.field(ti.f32, 3)  # B, gamma, c
+        self.parameters = ti.field(ti.f32, 4)  # B, gamma, c, viscosity
 
     @staticmethod
     def state(dim: int) -> dict[str, int]:
@@ -28,12 +29,27 @@ class WaterModel:
 
     @staticmethod
     def options(material) -> tuple:
-        """What is compiled in: gamma = 7 needs three products where any other exponent needs a power function."""
-        return (material.gamma == 7.0,)
+        """What is compiled in: gamma = 7 needs three products where any other exponent needs a power function; viscosity."""
+        return material.gamma == 7.0, material.viscosity > 0
+
+    @staticmethod
+    def omissions(material) -> dict[str, str]:
+        """What the numbers of this material leave out: name -> reason."""
+        return {} if material.viscosity else {"viscosity": "zero"}
 
     @staticmethod
     def rest_wave_speed(material, stiffness: float) -> float:
         return material.sound_speed * float(np.sqrt(stiffness))
+
+    @staticmethod
+    def rings(material) -> bool:
+        """Whether a particle alone on the grid resists both ways, and so is an oscillator."""
+        return True
+
+    @staticmethod
+    def largest_step(material, dim: int, dx: float) -> float:
+        """dt <= dx^2 rho0 / (2 d eta), explicit diffusion of momentum."""
+        return dx * dx * material.density / (2 * dim * material.viscosity) if material.viscosity else np.inf
 
     def fields(self) -> list:
         """Per-particle state fields."""
@@ -43,7 +59,7 @@ class WaterModel:
     def numbers(cls, material, dim: int, stiffness: float) -> tuple[float, ...]:
         """What ``parameters`` holds; ``stiffness`` multiplies the bulk modulus (a softened rung of a ladder)."""
         c = cls.rest_wave_speed(material, stiffness)
-        return material.density * c * c / material.gamma, material.gamma, c
+        return material.density * c * c / material.gamma, material.gamma, c, material.viscosity
 
     @ti.func
     def reset(self, p):
@@ -62,10 +78,15 @@ class WaterModel:
         return result
 
     @ti.func
-    def kirchhoff(self, p, gradient_dt):
-        J = self.J[p] * (1.0 + gradient_dt.trace())
+    def kirchhoff(self, p, gradient_dt, dt):
+        growth = gradient_dt.trace()
+        J = self.J[p] * (1.0 + growth)
         self.J[p] = J
-        return ti.Matrix.identity(ti.f32, self.dim) * (-self.parameters[0] * (self.power(J) - J))
+        tau = ti.Matrix.identity(ti.f32, self.dim) * (-self.parameters[0] * (self.power(J) - J))
+        if ti.static(self.viscous):
+            shear = gradient_dt + gradient_dt.transpose() - ti.Matrix.identity(ti.f32, self.dim) * (2.0 / self.dim * growth)
+            tau += (self.parameters[3] / dt) * shear
+        return tau
 
     @ti.func
     def energy_density(self, p):

@@ -1,0 +1,57 @@
+"""``python -m sim.gallery``: docs/gallery.md, a film strip of one test trajectory of every domain that has a scene."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from sim.errors import InputError
+from sim.generate import mpm_teacher, simulate, trajectory_seed
+from sim.paper import DOMAINS
+from sim.render import render_strip
+from sim.scene import SceneFamily
+from sim.trajectory import Trajectory, atomic_path
+
+HEAD = """# Gallery
+
+One test trajectory of each domain of Sanchez-Gonzalez et al. (2020) that our solvers make so far, six moments from start to end. Made by
+`make gallery`; the scenes are in `configs/scenes/`. Colour is speed, or the kind of matter where several meet.
+"""
+
+
+def caption(path: Path, trajectory: Trajectory) -> str:
+    """The first line of a scene file's head, the numbers of the trajectory, its status if it failed."""
+    said = path.read_text(encoding="utf-8").splitlines()[0].lstrip("# ").split(": ", 1)[-1]
+    frames, particles, dim = trajectory.position.shape
+    fixed = int((~trajectory.moving).sum())
+    counted = f"{particles - fixed} particles" + (f" and {fixed} of the boundary" if fixed else "")
+    return f"{said} {counted}, {frames - 1} steps of {trajectory.frame_step:g} s, {dim}D." + ("" if trajectory.ok else f" **{trajectory.status}**")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Make the gallery; see the module."""
+    parser = argparse.ArgumentParser(prog="python -m sim.gallery", description="A film strip of every domain.")
+    parser.add_argument("--scenes", type=Path, default=Path("configs/scenes"), help="folder of scene files (default configs/scenes)")
+    parser.add_argument("--out", type=Path, default=Path("docs"), help="folder of gallery.md and gallery/*.png (default docs)")
+    parser.add_argument("--width", type=int, default=180, help="pixels of a moment (default 180)")
+    options = parser.parse_args(arguments)
+    paths = [path for name in DOMAINS if (path := options.scenes / f"{name}.yaml").exists()]
+    if not paths:
+        print(InputError("sluice gallery", "scenes", str(options.scenes), "holds no scene of a domain"), file=sys.stderr)
+        return 2
+    teacher, sections = mpm_teacher(), []
+    for path in sorted(paths):
+        trajectory = simulate(teacher, SceneFamily.load(path).sample(trajectory_seed(0, "test", 0)))
+        name = path.stem
+        render_strip(options.out / "gallery" / f"{name}.png", trajectory, width=options.width)
+        sections.append(f"## {name.upper().replace('_', '-')}\n{caption(path, trajectory)}\n\n![{name}: six moments](gallery/{name}.png)")
+        print(f"{name}: {trajectory.status}", flush=True)
+    with atomic_path(options.out / "gallery.md") as temporary:
+        temporary.write_text("\n\n".join([HEAD.strip(), *sections]) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

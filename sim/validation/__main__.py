@@ -1,0 +1,5 @@
+import sys
+
+from sim.validation.ladder import main
+
+sys.exit(main())

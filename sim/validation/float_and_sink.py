@@ -1,0 +1,76 @@
+"""Float and sink: a rigid box floats with draft / height = rho_b / rho_w, rests on the floor if denser, and stays where it is if neutral."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+
+from sim.mpm.solver import MPMSimulator
+from sim.scene import Scene
+from sim.validation import Curve, Outcome
+
+NUMBER = 16
+#: Cells along the pool; the box is a quarter of it long.
+RESOLUTIONS = (16, 32, 64)
+WIDTH, HEIGHT, DEPTH = 0.25, 0.125, 0.5
+RATIOS = np.array([0.3, 0.5, 0.8])
+
+
+def run(resolution: int) -> Outcome:
+    """Three boxes that float, started at their draft in a pool as deep as without them, and one as dense as water in its middle."""
+    solver = MPMSimulator()
+    found = [float_and_sink(ratio, DEPTH - ratio * HEIGHT, resolution, simulator=solver) for ratio in RATIOS]
+    neutral = float_and_sink(1.0, 0.1875, resolution, simulator=solver)
+    ours, error = np.array([each["ours"] for each in found]), max(each["error"] for each in found)
+    drift = neutral["drift"] / HEIGHT
+    curves = {
+        "draft": Curve("largest relative error of the draft", ("rho_b / rho_w", "draft / height"), RATIOS, RATIOS, ours, error, 0.05),
+        "neutral": Curve("drift of a neutral box in 3 s over its height", ("", "drift / height"), np.array([0.0, 1.0]), np.zeros(2),
+                         np.array([0.0, drift]), drift, 0.05),
+    }  # fmt: skip
+    seconds = sum(each["seconds"] for each in (*found, neutral))
+    return Outcome("float_and_sink", resolution, len(pool_scene(1.0, 0.1875, resolution).particles().position), curves, seconds)
+
+
+def pool_scene(ratio: float, bottom: float, cells: int = 32, sound_speed: float = 15.0) -> Scene:
+    """A pool 1 wide and about 0.5 deep, a box 0.25 x 0.125 of ``ratio`` times water's density in its middle, its lower face at ``bottom``.
+
+    Where the box is, there is no water: the pool is made of the rectangles around it.
+    """
+    left, right, top = 0.5 - WIDTH / 2, 0.5 + WIDTH / 2, bottom + HEIGHT
+    water = [([0.0, 0.0], [left, DEPTH]), ([right, 0.0], [1.0, DEPTH]), ([left, 0.0], [right, min(bottom, DEPTH)]), ([left, top], [right, DEPTH])]
+    bodies = [{"material": "water", "kind": "box", "lower": lower, "upper": upper, "velocity": [0.0, 0.0]}
+              for lower, upper in water if lower[1] < upper[1] - 1e-9]
+    bodies.append({"material": "box", "kind": "box", "lower": [left, bottom], "upper": [right, top], "velocity": [0.0, 0.0]})
+    return Scene.model_validate({
+        "name": "pool", "dim": 2, "bounds": [[0.0, 1.0], [0.0, 1.0]], "gravity": [0.0, -9.8], "frame_step": 0.01, "frames": 300, "radius": 0.1,
+        "cells": [cells, cells], "seed": 0, "bodies": bodies,
+        "materials": {"water": {"model": "water", "sound_speed": sound_speed}, "box": {"model": "rigid", "density": 1000.0 * ratio}},
+    })
+
+
+def float_and_sink(ratio: float, bottom: float, cells: int = 32, seconds: float = 3.0, simulator: MPMSimulator | None = None) -> dict:
+    """Immersed share of the box's height, mean of the last second: ``ratio`` if it floats; the error is the relative difference.
+
+    The surface: mean height of the highest water particle of each cell column further than half a width from the box and the walls, plus
+    half a spacing. ``sunk``: height of the box's lower face over the floor at the end; ``drift``: how far its centre moved from the start.
+    """
+    scene = pool_scene(ratio, bottom, cells)
+    simulator = simulator or MPMSimulator()
+    simulator.load(scene)
+    particles = scene.particles()
+    box, begun, shares = particles.material == 1, time.perf_counter(), []
+    for frame in range(round(seconds / scene.frame_step)):
+        position = simulator.frame().astype(float)
+        if frame * scene.frame_step >= seconds - 1.0:
+            water = position[~box]
+            column = np.floor(water[:, 0] / scene.grid_spacing).astype(int)
+            middle = position[box].mean(0)
+            aside = [c for c in np.unique(column) if abs((c + 0.5) * scene.grid_spacing - middle[0]) > WIDTH and 2 <= c < cells - 2]
+            surface = np.mean([water[column == c, 1].max() for c in aside]) + scene.spacing / 2
+            shares.append((surface - (middle[1] - HEIGHT / 2)) / HEIGHT)
+    ours = float(np.mean(shares))
+    return {"reference": min(ratio, 1.0), "ours": ours, "error": abs(ours / ratio - 1), "seconds": time.perf_counter() - begun,
+            "sunk": float(position[box][:, 1].min() - scene.spacing / 2),
+            "drift": float(np.linalg.norm(position[box].mean(0) - particles.position[box].mean(0)))}  # fmt: skip

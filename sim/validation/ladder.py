@@ -1,0 +1,132 @@
+"""``python -m sim.validation``: every case at three resolutions, into docs/validation.md and a figure each.
+
+A case that fails its tolerance is written down as such; the page never leaves one out. Exit code 1 when one does.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+
+from sim.simulator import SimulationError
+from sim.trajectory import atomic_path
+from sim.validation import CASES, Outcome
+
+HEAD = """# Validation
+
+The solvers against formulae and experiments, each case at three resolutions: error, observed order (slope of log error over log resolution; it
+means nothing once an error is all rounding or all model), wall time of the frames on one core. A case holds when every error at its *finest*
+resolution is within tolerance. Made by `make validate` ({versions}); a case is one small file of `sim/validation/`, and the tests run each
+at a resolution that takes seconds.
+"""
+
+
+def module(case: str):
+    """The module of a case."""
+    return importlib.import_module(f"sim.validation.{case}")
+
+
+def _run(case: str, resolution: int) -> Outcome | str:
+    try:
+        return module(case).run(resolution)
+    except SimulationError as error:
+        return str(error)
+
+
+def order(resolutions: Sequence[int], errors: Sequence[float]) -> float:
+    """Observed order of convergence: minus the slope of log |error| over log resolution, by least squares."""
+    return float(-np.polyfit(np.log(resolutions), np.log(np.maximum(np.abs(errors), 1e-12)), 1)[0])
+
+
+def figure(title: str, outcomes: list[Outcome], path: Path) -> None:
+    """A row a comparison: the reference and ours at each resolution; error against wall time with the tolerance."""
+    from matplotlib.figure import Figure
+
+    names = list(outcomes[-1].curves)
+    canvas = Figure(figsize=(9, 2.9 * len(names) + 0.3), layout="constrained")
+    panels = canvas.subplots(len(names), 2, width_ratios=[1.4, 1], squeeze=False)
+    for (left, right), name in zip(panels, names, strict=True):
+        curves = [outcome.curves[name] for outcome in outcomes]
+        for outcome, curve, shade in zip(outcomes, curves, np.linspace(0.3, 1, len(curves)), strict=True):
+            left.plot(curve.x, curve.ours, ".-", ms=3, lw=1, color="C0", alpha=shade, label=f"resolution {outcome.resolution}")
+        left.plot(curves[-1].x, curves[-1].reference, "k--", lw=1.2, label="reference")
+        left.set(xlabel=curves[-1].axes[0], ylabel=curves[-1].axes[1], title=name)
+        left.legend(fontsize=7)
+        seconds, errors = [max(outcome.seconds, 1e-3) for outcome in outcomes], [max(abs(curve.error), 1e-9) for curve in curves]
+        right.loglog(seconds, errors, "o-", color="C0")
+        for outcome, *place in zip(outcomes, seconds, errors, strict=True):
+            right.annotate(f" {outcome.resolution}", place, fontsize=8)
+        right.axhline(curves[-1].tolerance, color="C3", lw=1, label="tolerance")
+        right.set(xlabel="wall time [s], one core", ylabel="error")
+        right.legend(fontsize=7)
+    canvas.suptitle(title, fontsize=11)
+    with atomic_path(path) as temporary:
+        canvas.savefig(temporary, format="svg")
+
+
+def page(found: dict[str, list[Outcome | str]], folder: Path, versions: str) -> tuple[str, bool]:
+    """The page in Markdown, and whether every case holds; writes the figures into ``folder``/validation."""
+    rows, sections, missed = [], [], []
+    for case, results in found.items():
+        what = module(case)
+        title, outcomes = what.__doc__.splitlines()[0].rstrip("."), [each for each in results if isinstance(each, Outcome)]
+        if len(outcomes) < len(results) or not all(curve.passed for curve in outcomes[-1].curves.values()):
+            missed.append(title.split(":")[0])
+        seconds = " / ".join(f"{each.seconds:.1f}" if isinstance(each, Outcome) else "-" for each in results)
+        for name in outcomes[-1].curves if outcomes else ["-"]:
+            curves = [each.curves[name] if isinstance(each, Outcome) else None for each in results]
+            errors = " / ".join("failed" if curve is None else f"{curve.error:.2g}" for curve in curves)
+            passed = curves[-1] is not None and None not in curves and curves[-1].passed
+            rate = "-" if None in curves else f"{order(what.RESOLUTIONS, [curve.error for curve in curves]):.1f}"
+            tolerance = "-" if curves[-1] is None else f"{curves[-1].tolerance:g}"
+            cells = [str(what.NUMBER), f"[{title.split(':')[0]}](#{case})", name, errors, tolerance, "yes" if passed else "**no**", rate, seconds]
+            rows.append("| " + " | ".join(cells) + " |")
+        lines = [f'<a id="{case}"></a>', f"## {what.NUMBER}. {title}", ""]
+        for resolution, each in zip(what.RESOLUTIONS, results, strict=True):
+            said = f"failed: {each}" if isinstance(each, str) else "; ".join(curve.label for curve in each.curves.values())
+            lines.append(f"- {resolution}: {said}")
+        if outcomes:
+            figure(title, outcomes, folder / "validation" / f"{case}.svg")
+            lines += ["", f"![{title}: ours beside the reference, error over run time](validation/{case}.svg)"]
+        sections.append("\n".join(lines))
+    verdict = f"{len(found) - len(missed)} of {len(found)} cases hold. Missed: {', '.join(missed)}." if missed else f"All {len(found)} cases hold."
+    table = "\n".join(["| | case | what | error, coarse / middle / fine | tolerance | holds | order | seconds |", "|---|" + "---|" * 7, *rows])
+    return "\n\n".join([HEAD.format(versions=versions).strip(), verdict, table, *sections]) + "\n", not missed
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the ladder; see the module."""
+    parser = argparse.ArgumentParser(prog="python -m sim.validation", description="Run the validation ladder.")
+    parser.add_argument("cases", nargs="*", metavar="CASE", help=f"these alone: {', '.join(CASES)}")
+    parser.add_argument("--out", type=Path, default=Path("docs"), help="folder of validation.md and validation/*.svg (default docs)")
+    options = parser.parse_args(arguments)
+    unknown = [case for case in options.cases if case not in CASES]
+    if unknown:
+        parser.error(f"no such case: {unknown[0]}; those are {', '.join(CASES)}")
+    chosen = sorted(options.cases or CASES, key=lambda case: module(case).NUMBER)
+    found: dict[str, list[Outcome | str]] = {}
+    # A process of its own, so that times do not depend on what was compiled before; one, so that they do not share the cores.
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        for case in chosen:
+            found[case] = []
+            for resolution in module(case).RESOLUTIONS:
+                outcome = pool.submit(_run, case, resolution).result()
+                found[case].append(outcome)
+                said = f"failed: {outcome}" if isinstance(outcome, str) else ", ".join(
+                    f"{name} {curve.error:.3g} ({curve.tolerance:g})" for name, curve in outcome.curves.items()) + f", {outcome.seconds:.1f} s"
+                print(f"{case} {resolution}: {said}", flush=True)
+    import taichi
+
+    from sim import __version__
+
+    text, holds = page(found, options.out, f"sluice {__version__}, taichi {'.'.join(map(str, taichi.__version__))}")
+    with atomic_path(options.out / "validation.md") as temporary:
+        temporary.write_text(text)
+    return 0 if holds else 1
+

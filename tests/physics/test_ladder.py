@@ -1,0 +1,65 @@
+"""The validation ladder at resolutions that take seconds, and the page it writes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sim.validation import CASES, Curve, Outcome
+from sim.validation.ladder import main, module, order, page
+
+#: Cases that hold, each at the least resolution that is worth its time. Those that do not hold yet are in docs/validation.md.
+AFFORDABLE = {
+    "rotation": 32, "return_map": 1000, "hydrostatics": 32, "elastic_column": 16, "axial_bar": 4, "cantilever": 4, "standing_wave": 32,
+    "dam_break": 16, "block_on_plane": 32, "elastic_discs": 40, "viscoplastic_slump": 40,
+}
+
+
+@pytest.mark.physics
+@pytest.mark.parametrize("case", AFFORDABLE)
+def test_case(case):
+    outcome = module(case).run(AFFORDABLE[case])
+    assert outcome.case == case and outcome.resolution == AFFORDABLE[case] and outcome.seconds > 0 and outcome.particles > 0
+    for name, curve in outcome.curves.items():
+        assert len(curve.x) == len(curve.ours) == len(curve.reference), name
+        assert np.isfinite(curve.ours).all(), name
+        assert curve.passed, f"{name}: {curve.label}: {curve.error:.4g}, tolerance {curve.tolerance:.4g}"
+
+
+def outcomes(case, *errors):
+    x = np.arange(3.0)
+    return [
+        Outcome(case, n, 10, {"thing": Curve(f"label {error}", ("x", "y"), x, x, x + error, error, 0.1)}, 0.1 * n)
+        for n, error in zip(module(case).RESOLUTIONS, errors, strict=True)
+    ]
+
+
+def test_order_of_convergence():
+    assert order((8, 16, 32), (0.4, 0.1, 0.025)) == pytest.approx(2.0)
+    assert order((8, 16, 32), (-0.4, 0.2, -0.1)) == pytest.approx(1.0)
+
+
+def test_the_page_says_what_failed(tmp_path):
+    found = {
+        "hydrostatics": outcomes("hydrostatics", 1, 1, 0.09), "dam_break": outcomes("dam_break", 0, 0, -0.11),
+        "rotation": [*outcomes("rotation", 0, 0, 0)[:2], "time step fell below 1e-9 s"],
+    }
+    text, holds = page(found, tmp_path, "versions")
+    assert not holds and "1 of 3 cases hold. Missed: Dam break, Rotation." in text
+    assert "failed: time step fell below" in text and "label -0.11" in text
+    assert sorted(path.stem for path in (tmp_path / "validation").iterdir()) == sorted(found)
+    text, holds = page({"hydrostatics": found["hydrostatics"]}, tmp_path, "versions")
+    assert holds and "All 1 cases hold." in text
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_every_case_is_complete(case):
+    found = module(case)
+    assert isinstance(found.NUMBER, int) and len(found.RESOLUTIONS) == 3 and list(found.RESOLUTIONS) == sorted(found.RESOLUTIONS)
+    assert ":" in found.__doc__.splitlines()[0], "a title, a colon, what is compared"
+
+
+def test_an_unknown_case_is_refused(capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(["no_such_case"])
+    assert stop.value.code == 2 and "no such case" in capsys.readouterr().err

@@ -1,0 +1,22 @@
+"""Materials in motion, beside the cases of ``sim.validation`` (test_ladder.py)."""
+
+import numpy as np
+import pytest
+
+from sim.validation.viscoplastic_slump import HALF, HEIGHT, RHO, YIELD, G, deposit, slump
+
+pytestmark = pytest.mark.physics
+
+
+def test_goop_without_yield_stress_runs_on_and_with_a_large_one_stands():
+    """The slump's column: a viscous fluid goes on, well beyond where the goop of the case stops; an elastic solid stands.
+
+    A fluid should be at the walls by then; its film, two cells thick here and held at the floor, is slower.
+    """
+    arrested = deposit(np.zeros(1), YIELD / (RHO * G), HALF * HEIGHT)[1]
+    _, position, *_ = slump(20, yield_stress=0.0)
+    assert np.abs(position[:, 0]).max() > 1.25 * arrested and position[:, 1].max() < 0.6 * HEIGHT
+    x, position, h, *_ = slump(20, yield_stress=1e9)
+    assert np.abs(position[:, 0]).max() < HALF * 1.03
+    # Its weight shortens it by rho g H / 2 M = 0.6 % and widens it as much; a cell at the rim may hold a column of particles less.
+    assert h[np.abs(x) < 0.7 * HALF] == pytest.approx(HEIGHT, rel=0.03)
