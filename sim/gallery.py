@@ -43,7 +43,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     teacher, sections = mpm_teacher(), []
     for path in sorted(paths):
-        trajectory = simulate(teacher, SceneFamily.load(path).sample(trajectory_seed(0, "test", 0)))
+        trajectory = simulate(teacher, SceneFamily.load(path).sample(trajectory_seed(0, "test", 0), "test"))
         name = path.stem
         render_strip(options.out / "gallery" / f"{name}.png", trajectory, width=options.width)
         sections.append(f"## {name.upper().replace('_', '-')}\n{caption(path, trajectory)}\n\n![{name}: six moments](gallery/{name}.png)")
