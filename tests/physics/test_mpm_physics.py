@@ -237,17 +237,17 @@ def test_columns_of_sand_collapse_and_come_to_rest(sand):
 
 
 def test_frictionless_sand_levels_out_and_steep_sand_stands(sand):
-    """phi = 0 is a liquid: half of what a column can release is gone, and its surface is flat; phi = 80 stands as a wall, as no 35 does."""
-    tops = {}
+    """phi = 0 is a liquid, whose surface is flat; phi = 80 crumbles at its upright faces and comes to rest steeper than 35 can."""
+    tops, reach = {}, {}
     for phi in (0.0, 35.0, 80.0):
         sand.load(scene(SAND | {"friction_angle": phi}, [box([0.875, 0.0], [1.125, 0.25])], **WIDE, walls={"friction": 0.7}))
         for _ in range(200):
             last = sand.frame()
-        heights = [last[np.abs(last[:, 0] - at) < 0.0625, 1] for at in (0.4, 1.0, 1.6)]
-        tops[phi] = [each.max() if len(each) else 0.0 for each in heights]
-    assert max(tops[0.0]) < 0.08, "an eighth of a box is 1/16 of WIDE, level to a cell"
-    assert tops[80.0][1] > 0.22 and tops[35.0][1] < 0.2
-    assert tops[80.0][0] == tops[80.0][2] == 0.0
+        tops[phi] = [last[np.abs(last[:, 0] - at) < 0.0625, 1].max(initial=0.0) for at in (0.4, 1.0, 1.6)]
+        reach[phi] = np.quantile(np.abs(last[:, 0] - 1), 0.9)
+    assert max(tops[0.0]) < 0.08 and min(tops[0.0]) > 0, "1/32 deep over the whole floor, level to a cell and a half"
+    assert sand.diagnostics()["max_speed"] < 0.02 and tops[80.0][0] == tops[80.0][2] == 0.0
+    assert tops[80.0][1] > 1.15 * tops[35.0][1] and reach[80.0] < 0.8 * reach[35.0]
 
 
 @pytest.mark.parametrize("mu", [0.15, 0.3])
