@@ -56,6 +56,7 @@ class Settings(BaseModel):
     ballistic: bool = False  # predictions start from gravity * dt^2 instead of the mean acceleration
     walls: bool = False  # with ``ballistic``: that flight stops at the walls; nothing stops a wrong prediction, so escapes stay visible
     unroll: tuple[PositiveInt, ...] = Field((1,), min_length=1)  # calls the loss is unrolled over, in equal shares of the training: (1, 2, 4)
+    flight_below: int = Field(0, ge=0)  # with ``ballistic``: particles with fewer neighbours than this fly; nothing is near that could hold them up
     # Impacts hold most of the acceleration's variance in a per cent of the particles: beyond this many standard deviations an error counts
     # linearly (Charbonnier's loss 2 h^2 (sqrt(1 + e^2 / h^2) - 1)); None: squared, as in the paper.
     huber: float | None = Field(None, gt=0)
@@ -69,6 +70,8 @@ class Settings(BaseModel):
     def _walls_stop_flight(self) -> Settings:
         if self.walls and not self.ballistic:
             raise ValueError("walls stops the ballistic flight; set ballistic: true with it")
+        if self.flight_below and not self.ballistic:
+            raise ValueError("flight_below means ballistic flight; set ballistic: true with it")
         return self
 
 
@@ -304,7 +307,10 @@ class GNS(nn.Module):
         return total / calls
 
     def _predict(self, position: Tensor, graph: Graph, particle_type: Tensor, bounds: Tensor, context: Tensor | None) -> Tensor:
-        return self.network(self.features.nodes(position, particle_type, bounds, context), self.features.edges(position, graph), graph)
+        output = self.network(self.features.nodes(position, particle_type, bounds, context), self.features.edges(position, graph), graph)
+        if self.options.flight_below:
+            output = output * (graph.offsets.diff() > self.options.flight_below)[:, None]  # every particle has its self edge as well
+        return output
 
     def begin(self, start: Start) -> None:
         """Take the last C + 1 model frames of the start. Raises ``ValueError`` on a start that is not of the model's kind."""

@@ -378,3 +378,15 @@ def test_relaxation_pushes_a_clump_apart_in_the_rollout_and_leaves_the_oracle_al
     plain = rollout(model, start(sparse, 6), 3).position
     model.options = model.options.model_copy(update={"relaxation": Relaxation()})
     np.testing.assert_array_equal(rollout(model, start(sparse, 6), 3).position, plain)
+
+
+def test_a_particle_with_too_few_neighbours_flies():
+    """Whatever the network says of it; a pair within reach is still the network's."""
+    frames = np.repeat(np.array([[[0.2, 0.9], [0.6, 0.5], [0.65, 0.5]]]), 6, axis=0).astype(np.float32)
+    model = small(ballistic=True, flight_below=1)
+    model.network.forward = lambda nodes, edges, graph: torch.full((3, 2), 5.0)
+    moved = rollout(model, start(frames, 6), 1).position[0] - frames[-1]
+    np.testing.assert_allclose(moved[0], [0, -9.81 * 0.01**2], atol=1e-7)
+    assert (moved[1:, 0] > 1e-3).all()
+    with pytest.raises(InputError, match="flight_below"):
+        small(flight_below=1)
