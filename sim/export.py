@@ -39,7 +39,7 @@ import numpy as np
 from sim import __version__
 from sim.errors import InputError, RunError
 from sim.generate import SPLITS, read_content
-from sim.trajectory import ShardReader, write_json
+from sim.trajectory import ShardReader, flush, write_json
 
 VIEWER_FORMATS = ("vtkhdf", "ply", "vtu")
 LEARNER_FORMATS = ("geoelements", "deepmind", "lagrangebench")
@@ -128,11 +128,8 @@ def _new_folder(path: Path) -> Iterator[Path]:
     try:
         yield temporary
         for file in temporary.rglob("*"):
-            descriptor = os.open(file, os.O_RDONLY)
-            try:
-                os.fsync(descriptor)
-            finally:
-                os.close(descriptor)
+            if file.is_file():
+                flush(file)
         os.replace(temporary, path)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)

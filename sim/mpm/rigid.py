@@ -37,6 +37,9 @@ NEAR = 0.1
 NO_SLIP = 1e9
 #: Nodes filled by bodies to this share of a cell are theirs: 1/2 is a body's face.
 SOLID = 0.5 - 1e-3
+#: Squared speed that stands for contacts beyond the list's end: its frame is taken back and repeated with half the step, whose gaps close
+#: fewer, until the trajectory fails.
+OVERFLOW = 1e30
 #: Columns of the table that ``load`` takes, before the planes.
 COLUMNS = 24
 
@@ -164,7 +167,7 @@ class RigidBodies:
 
     @ti.func
     def advance(self, dt):
-        """To the bodies' new places; returns the largest squared speed of a particle."""
+        """To the bodies' new places; returns the largest squared speed of a particle, one that no frame passes if contacts were too many to list."""
         for clear in ti.static((True, False)):
             for b in range(self.count[None]):
                 self.carry(b, dt, clear)
@@ -173,6 +176,8 @@ class RigidBodies:
             self.move(b, dt)
             self.shift_inside(b)
             fastest = ti.max(fastest, self.write(b))
+        if self.touching[None] > self.pair.shape[0]:
+            fastest = OVERFLOW
         return fastest
 
     @ti.func
@@ -305,7 +310,6 @@ class RigidBodies:
                             distance = length - self.radius[other]
                             normal = radial
                         self.touch(b, other, at, R @ normal, distance - half, 0.0, dt)
-        self.touching[None] = ti.min(self.touching[None], self.pair.shape[0])
 
     @ti.func
     def point_velocity(self, b, at):
@@ -347,7 +351,7 @@ class RigidBodies:
         while sweep < SWEEPS and change > SETTLED * largest:
             sweep += 1
             change = 0.0
-            for k in range(self.touching[None]):
+            for k in range(ti.min(self.touching[None], self.pair.shape[0])):
                 n = ti.Vector([self.normal[k][0], self.normal[k][1], self.normal[k][2]])
                 total = ti.Vector([self.impulse[k][0], self.impulse[k][1], self.impulse[k][2]])
                 pressed = total.dot(n)

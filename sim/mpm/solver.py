@@ -663,7 +663,6 @@ class MPMSimulator:
             kernels.load_rigid(body_table(scene, particles, data[:, : scene.dim].astype(float), self.dx, WALL, structure.rigid[1]))
         self._acceleration, self._frame, self._boundary = scene.acceleration(), 0, scene.boundary.astype(np.float32)
         self._cfl, self._least = self.settings["cfl"] or scene.cfl, self._fewest(scene, self.dx)
-        self._rings = self._ringing(scene, self.dx, 1.0) > 0
         self._position = np.zeros((len(position), scene.dim), np.float32)
         if fresh:
             # Compiles all that a frame needs; the tiny step is taken back.
@@ -820,7 +819,7 @@ class MPMSimulator:
             sums = self._run(substeps, dt, keep=attempt == 0)
             if np.isfinite(sums).all() and sums[6] == 0:
                 speed = float(np.sqrt(max(sums[3], sums[5])))
-                ring = self._rings and dt * sums[4] * np.sqrt(scene.dim) > self.dx
+                ring = self._ringing(scene, self.dx, sums[4]) and dt * sums[4] * np.sqrt(scene.dim) > self.dx
                 if dt * (speed + sums[4]) <= COURANT_GROWTH * self._cfl * self.dx and dt * speed <= self.dx and not ring:
                     self._frame += 1
                     return np.concatenate([self._position[self._tracked], self._boundary])
