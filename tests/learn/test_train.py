@@ -24,7 +24,7 @@ from learn import train as training
 from learn.checkpoint import load_model, load_state, read_model_file, save_model
 from learn.cli import main
 from learn.dataset import Dataset, DataSettings
-from learn.train import Adam, Config, Trainer, TrainSettings, load_config, rollout_score, train
+from learn.train import Adam, Config, Muon, Trainer, TrainSettings, load_config, rollout_score, train
 from sim.errors import InputError, RunError
 from sim.trajectory import ShardReader
 
@@ -274,6 +274,57 @@ def test_adam_is_the_published_rule() -> None:
         expected = expected - rate * (step + 0.1 * expected)
     torch.testing.assert_close(weight.detach().double(), expected, rtol=1e-5, atol=1e-6)
     assert torch.equal(unused, kept)
+
+
+def test_muon_makes_singular_values_alike() -> None:
+    """U diag(s) V^T -> U diag(s') V^T with s' near 1, for wide, tall and several matrices; nothing comes of nothing."""
+    generator = torch.Generator().manual_seed(0)
+    optimizer = Muon([], 0.0)
+    for shape in ((20, 48), (48, 20), (16, 16)):
+        left, _, right = torch.linalg.svd(torch.randn(3, *shape, generator=generator), full_matrices=False)
+        values = torch.linspace(0.1, 1.0, min(shape)) * torch.tensor([1e-6, 1.0, 1e6])[:, None]
+        found = left.mT @ optimizer.orthogonal(left * values[:, None] @ right) @ right.mT
+        diagonal = found.diagonal(dim1=1, dim2=2)
+        assert diagonal.min() > 0.6 and diagonal.max() < 1.25
+        torch.testing.assert_close(found, torch.diag_embed(diagonal), rtol=0, atol=1e-4)
+    assert not optimizer.orthogonal(torch.zeros(2, 16, 20)).any()
+
+
+def test_muon_steps_matrices_and_leaves_the_rest_to_adam() -> None:
+    """Its rule written out, a stencil's leading axis taken as rows; a bias goes Adam's way; what has no gradient stays; a restored run goes on."""
+    torch.manual_seed(0)
+
+    def parameters() -> list[torch.nn.Parameter]:
+        generator = torch.Generator().manual_seed(1)
+        return [torch.nn.Parameter(torch.randn(*shape, generator=generator)) for shape in ((9, 16, 20), (20, 30), (20, 30), (40,), (2, 30))]
+
+    mine, adams, resumed = parameters(), parameters(), parameters()
+    muon, adam = Muon(mine, weight_decay=0.1), Adam(adams[3:], weight_decay=0.1)
+    assert [tuple(momentum.shape) for momentum in muon.momentum] == [(1, 144, 20), (2, 20, 30)]
+    unused, expected, momentum = mine[1].detach().clone(), mine[0].detach().clone().view(144, 20), torch.zeros(144, 20)
+    for t in range(1, 7):
+        rate = 0.05 / t
+        for k, parameter in enumerate(mine):
+            parameter.grad = None if k == 1 else torch.randn(parameter.shape)
+        for one, other in zip(adams[3:], mine[3:], strict=True):
+            one.grad = other.grad.clone()
+        gradient = mine[0].grad.view(144, 20)
+        momentum = 0.95 * momentum + 0.05 * gradient
+        expected = expected * (1 - 0.1 * rate) - rate * 0.2 * 12 * muon.orthogonal((0.05 * gradient + 0.95 * momentum)[None])[0]
+        if t == 6:
+            for one, other in zip(resumed, mine, strict=True):
+                one.data.copy_(other)
+                one.grad = None if other.grad is None else other.grad.clone()
+            fresh = Muon(resumed, weight_decay=0.1)
+            fresh.restore({key: [value.clone() for value in values] for key, values in muon.state().items()})
+            fresh.step(rate)
+        muon.step(rate)
+        adam.step(rate)
+    torch.testing.assert_close(mine[0].detach().view(144, 20), expected, rtol=1e-4, atol=1e-5)
+    assert torch.equal(mine[1], unused) and all(torch.equal(*pair) for pair in zip(mine[3:], adams[3:], strict=True))
+    assert all(torch.equal(*pair) for pair in zip(mine, resumed, strict=True))
+    with pytest.raises(ValueError):
+        fresh.restore({**muon.state(), "momentum": muon.momentum[:1]})
 
 
 def test_schedules() -> None:
