@@ -141,7 +141,8 @@ def _edge_pass(graph: Graph, dtype: torch.dtype, table: Tensor, edges: Tensor, f
         for k in range(1, len(weights)):
             x = torch.addmm(biases[k - 1], x, weights[k - 1], out=hidden[k][kept]).relu_()
         x = torch.addmm(biases[-1], x, weights[-1], out=z[kept])
-        message, mean[kept], rstd[kept] = torch.native_layer_norm(x.to(gamma.dtype), (latent,), gamma, beta, NORM_EPSILON)
+        x = x if x.device.type == "cpu" else x.to(gamma.dtype)  # the CPU's kernel takes bf16 with weights in f32, and is spared a copy
+        message, mean[kept], rstd[kept] = torch.native_layer_norm(x, (latent,), gamma, beta, NORM_EPSILON)
         sums[run.receivers] = _bag_sum(message, run.order, run.offsets)
         torch.add(edges[run.edges], message.to(dtype), out=updated[run.edges])
     return sums, updated, (*hidden, z, mean, rstd)
