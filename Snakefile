@@ -38,7 +38,7 @@ wildcard_constraints:
     model="[a-z0-9][a-z0-9_-]*",
     seed=r"\d+",
     comparison="[a-z0-9][a-z0-9_-]*",
-    case="[a-z_]+",
+    job="[a-z0-9][a-z0-9_-]*",
 
 
 localrules:

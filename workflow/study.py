@@ -87,8 +87,8 @@ class Study:
         return self.content["comparisons"]
 
     @property
-    def stability(self) -> list[str]:
-        """Cases of the stress matrix; empty in a study that compares."""
+    def stability(self) -> dict[str, list[str]]:
+        """Cases of the stress matrix by job; empty in a study that compares."""
         return self.content["stability"]
 
     # -- places
@@ -168,10 +168,15 @@ class Study:
         """Hash of what the report says beyond its input files: title, targets, settings, and its code and template."""
         return digest(self.content, code_hash("workflow.scripts.summary"), (ROOT / "learn" / "report_template.html").read_text())
 
+    def stress_recipe(self, job: str) -> str:
+        """Hash of the code that the cases of a job run."""
+        return code_hash("workflow.scripts.stress", *(f"sim.stability.{case}" for case in self.stability[job]))
+
     def stability_recipe(self) -> str:
         """Hash of what a stability report says beyond its input files."""
         template = (ROOT / "sim" / "stability" / "report_template.html").read_text()
-        return digest(self.content, code_hash("workflow.scripts.stability_report", *(f"sim.stability.{case}" for case in self.stability)), template)
+        titles = [f"sim.stability.{case}" for cases in self.stability.values() for case in cases]
+        return digest(self.content, code_hash("workflow.scripts.stability_report", *titles), template)
 
     def budget(self, model: str) -> dict[str, float]:
         return {key: self.models[model][key] for key in ("minutes", "steps") if key in self.models[model]}
@@ -193,11 +198,14 @@ def load_study(path: str | Path) -> Study:
     if errors:
         # The deepest fault says most: a wrong type below beats "does not fit" above.
         raise _explain(max(errors, key=lambda error: len(error.absolute_path)), path)
-    content = {"data": {}, "models": {}, "comparisons": {}, "stability": {"cases": []}} | content
-    content["stability"] = content["stability"]["cases"]
-    for index, case in enumerate(content["stability"]):
-        if case not in CASES:
-            raise InputError(path, f"stability.cases[{index}]", case, f"no such case; those are {', '.join(CASES)}")
+    content = {"data": {}, "models": {}, "comparisons": {}, "stability": {}} | content
+    known: set[str] = set()
+    for job, cases in content["stability"].items():
+        for index, case in enumerate(cases):
+            if case not in CASES or case in known:
+                remedy = "a job runs this case already; leave it out" if case in known else f"no such case; those are {', '.join(CASES)}"
+                raise InputError(path, f"stability.{job}[{index}]", case, remedy)
+            known.add(case)
     families, configs = {}, {}
     for name, entry in content["data"].items():
         content["data"][name] = entry = {"seed": 0, "train": 0, "valid": 0, "test": 0, **entry}

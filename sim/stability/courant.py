@@ -2,8 +2,8 @@
 
 import time
 
-from sim.mpm.solver import MPMSimulator
-from sim.stability import BOUND, Cell, follow
+from sim.stability import BOUND, Cell
+from sim.stability.driver import ROUGH, follow
 from sim.validation import scene
 
 COURANT = (0.2, 0.4, 0.8, 1.2, 2.0, 2.8, 4.0)
@@ -22,12 +22,11 @@ def run() -> list[Cell]:
     """Dropped from two cells above a rough floor; energy at hand is what a fall to the floor would release."""
     cells = []
     for name, material in MATERIALS.items():
-        solver = MPMSimulator()
         for courant in COURANT:
             begun = time.perf_counter()
             body = {"kind": "box", "lower": [0.375, LIFT], "upper": [0.375 + WIDTH, LIFT + HEIGHT], "velocity": [0.5, 0.0]}
-            what = scene("courant", material, [body], [[0.0, 1.0]] * 2, [CELLS] * 2, 0.01, gravity=[0.0, -G], cfl=courant, walls={"friction": 0.5})
-            run = follow(solver, what, 100)
+            what = scene("courant", material, [body], [[0.0, 1.0]] * 2, [CELLS] * 2, 0.01, gravity=[0.0, -G], cfl=courant, walls=ROUGH)
+            run = follow(what, 100)
             mass = what.materials["stuff"].density * WIDTH * HEIGHT
             scale = mass * G * (LIFT + HEIGHT / 2)
             growth = run.growth(scale)

@@ -5,23 +5,23 @@ import time
 import numpy as np
 
 from sim.errors import InputError
-from sim.mpm.solver import MPMSimulator
-from sim.stability import Cell, follow
+from sim.stability import Cell
+from sim.stability.driver import follow, solver_for
 from sim.validation import scene
 
 CELLS, G, HALF, HEIGHT = 16, 9.8, 0.125, 0.375
 
 
-def _collapse(solver: MPMSimulator, angle: float) -> tuple[np.ndarray, float, float]:
+def _collapse(angle: float) -> tuple[np.ndarray, float, float]:
     """Final positions, final kinetic energy over what the fall released, slope of the flanks [degrees] of a column after two seconds."""
     material = {"model": "sand", "young_modulus": 3.5e5, "friction_angle": angle}
     body = {"kind": "box", "lower": [1 - HALF, 0.0], "upper": [1 + HALF, HEIGHT]}
     what = scene("friction-angle", material, [body], [[0.0, 2.0], [0.0, 1.0]], [2 * CELLS, CELLS], 0.01, gravity=[0.0, -G],
                  walls={"friction": 0.7})  # fmt: skip
-    run = follow(solver, what, 200)
+    run = follow(what, 200)
     if not run.ok:
         raise RuntimeError(run.status)
-    found = solver.diagnostics()
+    found = solver_for(what).diagnostics()
     released = 1800.0 * 2 * HALF * HEIGHT * G * HEIGHT / 2
     x, dx = run.position, 1 / CELLS
     column = np.floor(x[:, 0] / dx).astype(int)
@@ -33,11 +33,11 @@ def _collapse(solver: MPMSimulator, angle: float) -> tuple[np.ndarray, float, fl
 
 def run() -> list[Cell]:
     """A column three times as high as its half width, on a rough floor."""
-    solver, cells, reach, height = MPMSimulator(), [], {}, {}
+    cells, reach, height = [], {}, {}
     seconds = {}
     for angle in (0.0, 35.0, 80.0):
         begun = time.perf_counter()
-        x, kinetic, steepest = _collapse(solver, angle)
+        x, kinetic, steepest = _collapse(angle)
         reach[angle], height[angle] = float(np.quantile(np.abs(x[:, 0] - 1), 0.9)), float(np.quantile(x[:, 1], 0.98))
         seconds[angle] = (time.perf_counter() - begun, kinetic, steepest)
     level = 2 * HALF * HEIGHT / 2
@@ -55,7 +55,7 @@ def run() -> list[Cell]:
     for angle in (90.0, 120.0):
         begun = time.perf_counter()
         try:
-            _collapse(solver, angle)
+            _collapse(angle)
             said = "accepted"
         except InputError as error:
             said = str(error)

@@ -7,9 +7,9 @@ import time
 
 import numpy as np
 
-from sim.mpm.solver import MPMSimulator
-from sim.stability import Cell, follow
+from sim.stability import Cell
 from sim.stability.courant import MATERIALS
+from sim.stability.driver import ROUGH, follow, solver_for
 from sim.validation import scene
 
 CELLS, FRAME = 16, 0.001
@@ -21,16 +21,14 @@ def run() -> list[Cell]:
     """A lone particle, whose gradient is forced before the first frame."""
     cells = []
     for name, material in MATERIALS.items():
-        solver = MPMSimulator()
         body = {"kind": "box", "lower": [0.5, 0.5], "upper": [0.5 + 0.5 / CELLS] * 2}
-        what = scene("inverted", material, [body], [[0.0, 1.0]] * 2, [CELLS] * 2, FRAME, walls={"friction": 0.5})
+        what = scene("inverted", material, [body], [[0.0, 1.0]] * 2, [CELLS] * 2, FRAME, walls=ROUGH)
         for cell, squeeze in SQUEEZE.items():
             begun = time.perf_counter()
-            solver.load(what)
-            planned = solver.plan(what)["substeps_per_frame"][0]
+            planned = solver_for(what).plan(what)["substeps_per_frame"][0]
             forced = -squeeze * planned / FRAME
             # Along one axis alone: were both turned over, the determinant would be positive again.
-            run = follow(solver, what, 3, lambda solver, forced=forced: solver.inject("velocity gradient", 0, [[forced, 0.0], [0.0, 0.0]]))
+            run = follow(what, 3, lambda solver, forced=forced: solver.inject("velocity gradient", 0, [[forced, 0.0], [0.0, 0.0]]))
             taken = float(run.substeps[0]) if len(run.substeps) else np.nan
             if squeeze < 64:
                 right, expected = run.ok and taken > planned, "step rejected: shortened until it is sound"

@@ -8,9 +8,10 @@ import time
 import numpy as np
 
 from sim.errors import InputError
-from sim.mpm.solver import LONE_PARTICLE, MPMSimulator
+from sim.mpm.solver import LONE_PARTICLE
 from sim.scene import Scene
-from sim.stability import BOUND, Cell, Run, follow
+from sim.stability import BOUND, Cell
+from sim.stability.driver import Run, follow, solver_for
 
 #: Courant numbers of a map, dt (c + |v|) / dx.
 COURANT = (0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.4, 1.7, 2.0, 2.8, 4.0)
@@ -32,9 +33,9 @@ def outcome(run: Run, scale: float) -> str:
     return "not finite" if not run.ok else "bounded" if run.growth(scale) <= BOUND - 1 else "grew"
 
 
-def map_cell(case: str, cell: str, solver: MPMSimulator, what: Scene, bound: float, frames: int, numbers: dict, prepare=None) -> Cell:
+def map_cell(case: str, cell: str, what: Scene, bound: float, frames: int, numbers: dict, prepare=None) -> Cell:
     """One cell: ``what`` has a fixed ``time_step``; ``bound``: the limit by hand [s]."""
-    begun = time.perf_counter()
+    begun, solver = time.perf_counter(), solver_for(what)
     try:
         solver.load(what)
         refused = ""
@@ -42,13 +43,13 @@ def map_cell(case: str, cell: str, solver: MPMSimulator, what: Scene, bound: flo
         refused = str(error)
     if refused:
         solver.unguarded_step = what.time_step
-        run = follow(solver, what, frames, prepare)
+        run = follow(what, frames, prepare)
         solver.unguarded_step = None
         free = outcome(run, run.energy[0])
         right = what.time_step > bound and f"{bound:.4g} s" in refused
         observed = f"refused; run all the same, its energy was {free}" if free != "not finite" else "refused; run all the same, it was not finite"
     else:
-        run = follow(solver, what, frames, prepare)
+        run = follow(what, frames, prepare)
         free = outcome(run, run.energy[0])
         right = what.time_step <= bound * (1 + 1e-6) and free != "grew"
         observed = {"bounded": "bounded", "grew": "accepted, and its energy grew", "not finite": run.status}[free]
@@ -57,10 +58,10 @@ def map_cell(case: str, cell: str, solver: MPMSimulator, what: Scene, bound: flo
     return Cell(case, cell, right, EXPECTED, observed, numbers, time.perf_counter() - begun)
 
 
-def adaptive_cell(case: str, cell: str, solver: MPMSimulator, what: Scene, bound: float, frames: int, numbers: dict, prepare=None) -> Cell:
+def adaptive_cell(case: str, cell: str, what: Scene, bound: float, frames: int, numbers: dict, prepare=None) -> Cell:
     """The same start without a fixed step."""
     begun = time.perf_counter()
-    run = follow(solver, what, frames, prepare)
+    run = follow(what, frames, prepare)
     largest, smallest = float(run.dt.max(initial=0.0)), float(run.dt.min(initial=np.inf))
     right = run.ok and largest <= bound * (1 + 1e-6) and outcome(run, run.energy[0]) == "bounded"
     observed = f"dt {smallest:.3g} to {largest:.3g} s, energy {outcome(run, run.energy[0])}" if run.ok else run.status

@@ -8,10 +8,10 @@ import numpy as np
 
 from sim.errors import RunError
 from sim.generate import generate, simulate
-from sim.mpm.solver import MPMSimulator
 from sim.scene import SceneFamily
 from sim.stability import Cell
 from sim.stability.courant import MATERIALS
+from sim.stability.driver import ROUGH, solver_for
 from sim.stability.refusal import FAMILY
 
 #: Frame before which a teacher goes wrong.
@@ -20,24 +20,28 @@ WHEN = 4
 STATES = {"water": "stuff.J", "sand": "stuff.b - I"}
 
 
-class Poisoned(MPMSimulator):
+class Poisoned:
     """A teacher that writes ``value`` into a particle before frame ``WHEN``."""
 
+    name, kind, settings, compile_seconds = "poisoned", "solver", {}, 0.0
     where, value = "velocity", np.nan
 
     def load(self, scene) -> None:
-        super().load(scene)
-        self.count = 0
+        self.solver, self.count = solver_for(scene), 0
+        self.solver.load(scene)
 
     def frame(self) -> np.ndarray:
         self.count += 1
         if self.count == WHEN:
-            self.inject(self.where, 7, self.value)
-        return super().frame()
+            self.solver.inject(self.where, 7, self.value)
+        return self.solver.frame()
+
+    def diagnostics(self) -> dict[str, float]:
+        return self.solver.diagnostics()
 
 
 def _family(name: str) -> SceneFamily:
-    changes = {"materials": {"stuff": MATERIALS[name]}, "frames": 8, "gravity": [0.0, -9.8], "walls": {"friction": 0.5}}
+    changes = {"materials": {"stuff": MATERIALS[name]}, "frames": 8, "gravity": [0.0, -9.8], "walls": ROUGH}
     return SceneFamily(FAMILY | changes, "nan.yaml")
 
 

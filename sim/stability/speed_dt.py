@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from sim.mpm.solver import MPMSimulator
 from sim.stability import Cell
+from sim.stability.driver import ROUGH
 from sim.stability.maps import COURANT, STEPS_A_FRAME, adaptive_cell, limit, map_cell
 from sim.stability.young_dt import BOX, CELLS, NU, RHO, wave_speed
 from sim.validation import scene
@@ -16,17 +16,17 @@ MATERIAL = {"model": "elastic", "density": RHO, "young_modulus": E, "poisson_rat
 
 def run() -> list[Cell]:
     """From two cells off the wall until it would have bounced back to the middle of the box, twice over."""
-    solver, cells, c = MPMSimulator(), [], wave_speed(E)
+    cells, c = [], wave_speed(E)
     body = {"kind": "box", "lower": [GAP, 0.375], "upper": [GAP + SIDE, 0.375 + SIDE]}
     for mach in MACH:
         v = mach * c
         bound, duration, thrown = limit(0.4, 1 / CELLS, c, v), 2 * (GAP + 0.5) / v + 4 * SIDE / c, [body | {"velocity": [-v, 0.0]}]
         for courant in COURANT:
             dt = courant / CELLS / (c + v)
-            what = scene("speed-dt", MATERIAL, thrown, BOX, [CELLS] * 2, dt * STEPS_A_FRAME, time_step=dt)
-            cells.append(map_cell("speed_dt", f"v {mach:g} c, C {courant:g}", solver, what, bound,
+            what = scene("speed-dt", MATERIAL, thrown, BOX, [CELLS] * 2, dt * STEPS_A_FRAME, time_step=dt, walls=ROUGH)
+            cells.append(map_cell("speed_dt", f"v {mach:g} c, C {courant:g}", what, bound,
                                   int(np.ceil(duration / what.frame_step)), {"speed": v, "mach": mach, "courant": courant}))  # fmt: skip
-        what = scene("speed-dt", MATERIAL, thrown, BOX, [CELLS] * 2, bound * STEPS_A_FRAME)
-        cells.append(adaptive_cell("speed_dt", f"v {mach:g} c, adaptive", solver, what, bound, int(np.ceil(duration / what.frame_step)),
+        what = scene("speed-dt", MATERIAL, thrown, BOX, [CELLS] * 2, bound * STEPS_A_FRAME, walls=ROUGH)
+        cells.append(adaptive_cell("speed_dt", f"v {mach:g} c, adaptive", what, bound, int(np.ceil(duration / what.frame_step)),
                                    {"speed": v, "mach": mach}))  # fmt: skip
     return cells

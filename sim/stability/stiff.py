@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from sim.mpm.solver import MPMSimulator
-from sim.stability import Cell, follow
+from sim.stability import Cell
 from sim.stability.command_line import command
+from sim.stability.driver import ROUGH, follow
 from sim.stability.refusal import FAMILY
 from sim.validation import scene
 
@@ -18,6 +18,7 @@ E, NU, RHO, OMEGA, CELLS, DURATION, FRAMES = 1e6, 0.3, 1000.0, 10.0, 16, 0.1, 10
 EXPECTED = "the same answer at a cost that grows as the root"
 #: Stretch of the softest block, rho (w R)^2 / E at its corners, R its half diagonal: answers may differ by that much of R.
 RADIUS = 0.125 * np.sqrt(2)
+EPS = float(np.finfo(np.float32).eps)
 TOLERANCE = RHO * (OMEGA * RADIUS) ** 2 / E * RADIUS
 
 
@@ -27,18 +28,18 @@ def run() -> list[Cell]:
     The start has no affine velocities, so the first transfer spreads its angular momentum over them as well: a particle's moment of inertia
     on the grid is r^2 + dx^2 / 2 (Jiang et al. 2015), and the block turns at w sum r^2 / sum (r^2 + dx^2 / 2).
     """
-    solver, cells, first = MPMSimulator(), [], None
+    cells, first = [], None
     for factor in FACTORS:
         begun = time.perf_counter()
         material = {"model": "elastic", "density": RHO, "young_modulus": E * factor, "poisson_ratio": NU}
         body = {"kind": "box", "lower": [0.375, 0.375], "upper": [0.625, 0.625]}
-        what = scene("stiff", material, [body], [[0.0, 1.0]] * 2, [CELLS] * 2, DURATION / FRAMES, gravity=[0.0, -9.8])
+        what = scene("stiff", material, [body], [[0.0, 1.0]] * 2, [CELLS] * 2, DURATION / FRAMES, gravity=[0.0, -9.8], walls=ROUGH)
         x = what.particles().position - 0.5
 
         def spin(solver, x=x) -> None:
             solver.set_velocity(OMEGA * np.stack([-x[:, 1], x[:, 0]], 1) + [0.0, 0.5])
 
-        run = follow(solver, what, FRAMES, spin)
+        run = follow(what, FRAMES, spin)
         inertia = (x**2).sum()
         steps, angle = float(run.substeps.sum()), OMEGA * DURATION * inertia / (inertia + len(x) / CELLS**2 / 2)
         first = first or steps
@@ -46,9 +47,11 @@ def run() -> list[Cell]:
         exact = turned + 0.5 + [0.0, 0.5 * DURATION - 9.8 / 2 * DURATION**2]
         error = float(np.abs(run.position - exact).max()) if run.ok else np.inf
         cost = steps / first / np.sqrt(factor)
-        right = run.ok and error <= TOLERANCE and 0.5 <= cost <= 1.1
+        # Each step rounds every velocity to eps, for a body that turns always with the same sign.
+        tolerance = TOLERANCE + steps * EPS * angle * RADIUS
+        right = run.ok and error <= tolerance and 0.5 <= cost <= 1.1
         observed = f"{steps:.0f} steps, at most {error:.2g} m from a rigid block" if run.ok else run.status
-        numbers = {"factor": factor, "steps": steps, "steps_over_root": cost, "error": error, "tolerance": TOLERANCE}
+        numbers = {"factor": factor, "steps": steps, "steps_over_root": cost, "error": error, "tolerance": tolerance}
         curve = {f"E x {factor:g}": run.energy_curve(run.energy[0])} if run.ok else {}
         cells.append(Cell("stiff", f"E x {factor:g}", right, EXPECTED, observed, numbers, time.perf_counter() - begun, curve))
     return [*cells, _budget()]

@@ -81,7 +81,7 @@ MISTAKES = [
     (drop(*COMPARISON, "targets", 0, "at"), "targets[0].at = None: rollout_mse_moving is known at"),
     (put(*COMPARISON, "targets", 0, "metric", value="emd"), "targets[0].at = 'all': emd is known at 0.25, 0.5, 0.75, 1"),
     (put(*COMPARISON, "targets", 0, "metric", value="escaped_fraction"), "targets[0].at = 'all': escaped_fraction is one figure; leave it out"),
-    (put("stability", value={"cases": ["rest"]}), "a study of stability has title and stability alone"),
+    (put("stability", value={"a": ["rest"]}), "a study of stability has title and stability alone"),
     (lambda content: content["comparisons"].update(again=content["comparisons"]["puddle"]), "two comparisons share this one"),
 ]
 
@@ -95,9 +95,9 @@ def test_mistakes_are_named(place, monkeypatch, change, line):
 
 
 @pytest.mark.parametrize(("stability", "line"), [
-    ({"cases": ["rest", "unrest"]}, "stability.cases[1] = 'unrest': no such case; those are young_dt, speed_dt"),
-    ({"cases": ["rest", "rest"]}, "stability.cases = ['rest', 'rest']"), ({"cases": []}, "stability.cases = []"),
-    ({"case": ["rest"]}, "stability.case = ['rest']: unknown key; the keys here are cases"), ({}, "stability.cases = None: missing; add it"),
+    ({"a": ["rest", "unrest"]}, "stability.a[1] = 'unrest': no such case; those are young_dt, speed_dt"),
+    ({"a": ["rest"], "b": ["rest"]}, "stability.b[0] = 'rest': a job runs this case already"), ({"a": []}, "stability.a = []"),
+    ({"A job": ["rest"]}, "use small letters"), ({"a": "rest"}, "stability.a = 'rest': must be of type array"), ({}, "stability = []"),
     (["rest"], "stability = ['rest']: must be of type object"),
 ])  # fmt: skip
 def test_mistakes_in_a_stability_study_are_named(place, monkeypatch, stability, line):
@@ -153,7 +153,8 @@ def test_shipped_studies_resolve(place, name):
 @pytest.mark.workflow
 def test_the_stability_study_runs_every_case(place):
     jobs = planned(place, study="configs/studies/stability.yaml")
-    assert jobs == {"stability_case": len(CASES), "report": 1}
+    study = yaml.safe_load((place / "configs" / "studies" / "stability.yaml").read_text())["stability"]
+    assert jobs == {"stress": len(study), "report": 1} and sorted(sum(study.values(), [])) == sorted(CASES)
 
 
 def test_the_paper_study_is_the_papers_size():

@@ -1,28 +1,29 @@
-"""The stress matrix: a job a case, since starting Taichi and compiling take longer than most cells; then summary and report."""
+"""The stress matrix: a few jobs of several cases, since starting Taichi and compiling take longer than most cells; then summary and report."""
 
 
-rule stability_case:
+rule stress:
     output:
-        f"{RESULTS}/cases/{{case}}.json",
+        f"{RESULTS}/cells/{{job}}.json",
     params:
-        code=lambda wildcards: code_hash("workflow.scripts.stability_case", f"sim.stability.{wildcards.case}"),
+        cases=lambda wildcards: STUDY.stability[wildcards.job],
+        code=lambda wildcards: STUDY.stress_recipe(wildcards.job),
     log:
-        f"{RESULTS}/logs/stability_case/{{case}}.log",
+        f"{RESULTS}/logs/stress/{{job}}.log",
     benchmark:
-        f"{RESULTS}/benchmarks/stability_case/{{case}}.tsv"
+        f"{RESULTS}/benchmarks/stress/{{job}}.tsv"
     threads: 1
     resources:
         mem_mb=1500,
         runtime=30,
     message:
-        "Stress: {wildcards.case}"
+        "Stress: {params.cases} (progress in {log})"
     shell:
-        "{PYTHON} -m workflow.scripts.stability_case {wildcards.case} {output} > {log} 2>&1"
+        "{PYTHON} -m workflow.scripts.stress {output} {params.cases} > {log} 2>&1"
 
 
 rule report:
     input:
-        expand(f"{RESULTS}/cases/{{case}}.json", case=STUDY.stability),
+        expand(f"{RESULTS}/cells/{{job}}.json", job=STUDY.stability),
     output:
         summary=f"{RESULTS}/summary.json",
         report=f"{RESULTS}/report.html",

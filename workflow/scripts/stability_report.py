@@ -1,4 +1,4 @@
-"""``summary.json`` and ``report.html`` of a stability study. ``python -m workflow.scripts.stability_report STUDY SUMMARY REPORT CASE ...``"""
+"""``summary.json`` and ``report.html`` of a stability study. ``python -m workflow.scripts.stability_report STUDY SUMMARY REPORT CELLS ...``"""
 
 import json
 import sys
@@ -10,8 +10,8 @@ from workflow.results import how_to_repeat
 from workflow.study import load_study
 
 
-def main(path: str, out: str, report: str, *cases: str) -> None:
-    study, found = load_study(path), [json.loads(Path(case).read_text()) for case in cases]
+def main(path: str, out: str, report: str, *cells: str) -> None:
+    study, found = load_study(path), [json.loads(Path(each).read_text()) for each in cells]
     rows = [row for each in found for row in each["rows"]]
     summary = {"title": study.content["title"], "verdict": verdict(rows), "rows": rows, "provenance": how_to_repeat(study)}
     summary |= {key: found[0][key] for key in ("hardware", "versions")}
