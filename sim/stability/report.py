@@ -18,6 +18,7 @@ from sim.trajectory import atomic_path
 
 #: Points of a curve in the summary: more show nothing on a page.
 _POINTS = 200
+_OUTCOMES = {"bounded": "energy bounded", "grew": "energy grew", "not finite": "failed and said so"}
 _COLOURS = {"bounded": "C0", "grew": "C1", "not finite": "C3"}
 #: Case -> (key of its map's other axis, that axis' name).
 MAPS = {"young_dt": ("young_modulus", "Young's modulus E [Pa]"), "speed_dt": ("speed", "speed v [m/s]")}
@@ -88,8 +89,8 @@ def map_figure(rows: Sequence[Mapping], case: str):
         chosen = [one for one in fixed if one["refused"] == refused and one["outcome"] == outcome]
         if chosen:
             colour = _COLOURS[outcome]
-            panel.plot([one[key] for one in chosen], [one["time_step"] for one in chosen], "s", ms=7, color=colour,
-                       mfc="none" if refused else colour, label=f"{'refused' if refused else 'accepted'}; energy {outcome}")  # fmt: skip
+            panel.plot([one[key] for one in chosen], [one["time_step"] for one in chosen], "s", ms=5, color=colour,
+                       mfc="none" if refused else colour, label=f"{'refused' if refused else 'accepted'}; {_OUTCOMES[outcome]}")  # fmt: skip
     columns = {one[key]: one for one in fixed}
     x = sorted(columns)
     panel.plot(x, [columns[each]["limit"] for each in x], "k-", lw=1.5, label="limit of the solver, 0.4 dx / (c + v)")
