@@ -17,6 +17,7 @@ from sim.mpm.solver import MPMSimulator
 from sim.plan import plan
 from sim.scene import Scene, SceneFamily
 from sim.stability import CASES, Cell, Series
+from sim.stability.driver import ROUGH, solver_for
 from sim.stability.report import row, title, verdict, write_report
 from sim.validation import scene
 
@@ -136,29 +137,28 @@ def test_a_step_must_divide_the_frame():
     SceneFamily(FAMILY | {"time_step": 0.0011111111}, "family.yaml")
 
 
-def falling(step, **changes) -> Scene:
+def falling(step: float | None, **changes) -> Scene:
     body = {"kind": "box", "lower": [0.25, 0.125], "upper": [0.5, 0.375], "velocity": [0.0, -2.0]}
-    return scene("falling", FAMILY["materials"]["stuff"], [body], [[0.0, 1.0]] * 2, [16, 16], 0.01, frames=10, time_step=step, **changes)
+    return scene("falling", FAMILY["materials"]["stuff"], [body], [[0.0, 1.0]] * 2, [16, 16], 0.01, frames=10, time_step=step,
+                 walls=ROUGH, **changes)  # fmt: skip
 
 
 def test_a_fixed_step_is_taken_and_recorded():
-    trajectory = simulate(MPMSimulator(), falling(0.0005))
+    trajectory = simulate(solver_for(falling(0.0005)), falling(0.0005))
     assert trajectory.ok and set(trajectory.diagnostics["substeps"][1:]) == {20} and set(trajectory.diagnostics["dt"][1:]) == {0.0005}
     assert trajectory.scene["time_step"] == 0.0005 and "time_step" not in falling(None).to_dict()
 
 
 def test_a_fixed_step_that_the_run_outgrows_ends_it():
     """Squeezed in the impact, water stiffens beyond what a step at the limit bears; it is not shortened behind the user's back."""
-    trajectory = simulate(MPMSimulator(), falling(0.001, materials={"stuff": FAMILY["materials"]["stuff"] | {"sound_speed": 22.0}},
-                                                  gravity=[0.0, -400.0], cfl=0.45))
-    assert trajectory.status.startswith("failed: the fixed time step 0.001 s gave no finite, stable frame")
+    what = falling(0.01 / 11, gravity=[0.0, -400.0])
+    trajectory = simulate(solver_for(what), what)
+    assert trajectory.status.startswith("failed: the fixed time step 0.000909 s gave no finite, stable frame")
 
 
 def test_a_rung_with_its_own_courant_number_is_adaptive():
-    solver = MPMSimulator(cfl=0.8)
-    solver.load(falling(0.0005))
-    solver.frame()
-    assert solver.diagnostics()["substeps"] < 20
+    assert MPMSimulator().plan(falling(0.0005))["substeps_per_frame"] == [20, 20]
+    assert MPMSimulator(cfl=0.8).plan(falling(0.0005))["substeps_per_frame"][0] < 20
 
 
 # -- the page
