@@ -656,7 +656,7 @@ class MPMSimulator:
         kernels = self._kernels
         lower, upper = np.array(scene.bounds).T
         cells = self._cells(scene)
-        self.dx = float((upper[0] - lower[0]) / cells[0])
+        self.dx = self._spacing(scene)
         self._scene, self._tracked = scene, particles.tracked
         position = particles.position
         if self.settings["perturbation"]:
@@ -741,14 +741,17 @@ class MPMSimulator:
         """Whether some material resists when it is parted, so that a particle alone on the grid is an oscillator (``LONE_PARTICLE``)."""
         return any(MODELS[material.model].rings(material) for material in scene.materials.values())
 
-    def limits(self, scene: Scene, wave_speed: float, speed: float) -> dict[str, float]:
-        """Bounds on the time step [s] at a wave speed and a speed of particles [m/s], by what sets them:
+    def _spacing(self, scene: Scene) -> float:
+        lower, upper = np.array(scene.bounds).T
+        return float((upper[0] - lower[0]) / self._cells(scene)[0])
+
+    def limits(self, scene: Scene, dx: float, wave_speed: float, speed: float) -> dict[str, float]:
+        """Bounds on the time step [s] on a grid of spacing dx, at a wave speed and a speed of particles [m/s], by what sets them:
 
         cfl dx / (c + |v|); ``LARGEST_COURANT`` dx / c; dx^2 / (2 d nu), the viscosity of each viscous material;
         ``LONE_PARTICLE`` dx / (sqrt(d) c).
         """
-        lower, upper = np.array(scene.bounds).T
-        dx, tiny = float((upper[0] - lower[0]) / self._cells(scene)[0]), np.finfo(float).tiny
+        tiny = np.finfo(float).tiny
         found = {
             "the Courant number": self._courant(scene) * dx / max(wave_speed + speed, tiny),
             "sound across a cell": LARGEST_COURANT * dx / max(wave_speed, tiny),
@@ -769,7 +772,7 @@ class MPMSimulator:
         if scene.time_step is None or self.settings["cfl"]:
             return
         wave_speed, speed = self._at_start(scene, max(float(np.linalg.norm(body.velocity)) for body in scene.bodies))
-        limits = self.limits(scene, wave_speed, speed)
+        limits = self.limits(scene, self._spacing(scene), wave_speed, speed)
         what = min(limits, key=limits.get)
         if scene.time_step > limits[what] * (1 + 1e-6):
             steps = int(np.ceil(scene.frame_step / limits[what]))
@@ -790,7 +793,7 @@ class MPMSimulator:
         dim, models, friction = structure.dim, structure.models, structure.friction
         particles, cells = scene.particles(self._refine(scene)), self._cells(scene)
         lower, upper = np.array(scene.bounds).T
-        dx = float((upper[0] - lower[0]) / cells[0])
+        dx = self._spacing(scene)
         n, nodes = _power_of_two(len(particles.position)), int(np.prod(cells + 2 * WALL + 1))
         particle_fields = {"x": dim, "v": 4, **{f"C{axis}": 4 for axis in range(dim)}}
         left_out = {"third dimension": "a 2D scene"} if dim == 2 else {}
@@ -828,7 +831,7 @@ class MPMSimulator:
         start = float(np.sqrt((particles.velocity**2).sum(1).max()))
         fall = float(np.sqrt(start**2 + 2 * gravity * np.linalg.norm(upper - lower)))
         wave_speed, _ = self._at_start(scene, 0.0)
-        substeps = [self._substeps(scene, wave_speed, v + gravity * scene.frame_step) for v in (0.0, fall)]
+        substeps = [self._substeps(scene, dx, wave_speed, v + gravity * scene.frame_step) for v in (0.0, fall)]
         return {
             "dim": dim, "materials": [name for name, *_ in models], "walls": friction, "obstacles": len(scene.obstacles),
             "context": 0 if context is None else context.shape[1], "kernels": kernels, "fields": fields, "left_out": left_out,
@@ -851,12 +854,12 @@ class MPMSimulator:
         """The fixed time step [s], None for an adaptive one."""
         return self.unguarded_step or (None if self.settings["cfl"] else scene.time_step)
 
-    def _substeps(self, scene: Scene, wave_speed: float, speed: float) -> int:
+    def _substeps(self, scene: Scene, dx: float, wave_speed: float, speed: float) -> int:
         """Of a frame: as many as the fixed step asks for, else the fewest that obey the ``limits``."""
         fixed = self._fixed(scene)
         if fixed is not None:
             return max(1, round(scene.frame_step / fixed))
-        return max(1, int(np.ceil(scene.frame_step / min(self.limits(scene, wave_speed, speed).values()))))
+        return max(1, int(np.ceil(scene.frame_step / min(self.limits(scene, dx, wave_speed, speed).values()))))
 
     def frame(self) -> np.ndarray:
         """Advance one frame; positions of the recorded particles, kinematic ones last, [n, dim] float32. Raises ``SimulationError``.
@@ -868,7 +871,7 @@ class MPMSimulator:
         scene, known, fixed = self._scene, self._diagnostics, self._fixed(self._scene)
         felt = scene.gravity - self._acceleration[min(self._frame, len(self._acceleration) - 1)]
         reach = float(np.linalg.norm(felt)) * scene.frame_step
-        substeps = self._substeps(scene, known["wave_speed"], known["max_speed"] + reach)
+        substeps = self._substeps(scene, self.dx, known["wave_speed"], known["max_speed"] + reach)
         for attempt in range(1 if fixed else MAX_HALVINGS + 1):
             dt = scene.frame_step / substeps
             sums = self._run(substeps, dt, keep=attempt == 0)
