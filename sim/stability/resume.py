@@ -17,7 +17,7 @@ from sim.stability import Cell
 from sim.stability.courant import MATERIALS
 from sim.stability.refusal import FAMILY
 
-TRAJECTORIES, DEADLINE = 6, 300.0
+TRAJECTORIES, DEADLINE = 6, 1500.0
 
 
 def run() -> list[Cell]:
