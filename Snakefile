@@ -20,11 +20,17 @@ RESULTS = str(STUDY.folder)
 PYTHON = sys.executable
 
 
-include: "workflow/rules/data.smk"
-include: "workflow/rules/train.smk"
-include: "workflow/rules/compare.smk"
-include: "workflow/rules/pictures.smk"
-include: "workflow/rules/report.smk"
+if STUDY.stability:
+
+    include: "workflow/rules/stability.smk"
+
+else:
+
+    include: "workflow/rules/data.smk"
+    include: "workflow/rules/train.smk"
+    include: "workflow/rules/compare.smk"
+    include: "workflow/rules/pictures.smk"
+    include: "workflow/rules/report.smk"
 
 
 wildcard_constraints:
@@ -32,6 +38,7 @@ wildcard_constraints:
     model="[a-z0-9][a-z0-9_-]*",
     seed=r"\d+",
     comparison="[a-z0-9][a-z0-9_-]*",
+    job="[a-z0-9][a-z0-9_-]*",
 
 
 localrules:

@@ -88,7 +88,7 @@ def _family(options: argparse.Namespace):
 
 def _generate(options: argparse.Namespace) -> int:
     from sim.generate import SPLITS, generate
-    from sim.plan import check_budget
+    from sim.plan import check_budget, check_time_step
 
     family = _family(options)
     if options.count is not None and options.split is None:
@@ -97,6 +97,7 @@ def _generate(options: argparse.Namespace) -> int:
     if options.count is not None:
         counts[options.split] = options.count
     counts = {split: count for split, count in counts.items() if count}
+    check_time_step(family, counts, options.seed)
     check_budget(family, sum(counts.values()), options.budget)
     content = generate(family, counts, options.out, jobs=options.jobs, seed=options.seed, shard_size=options.shard_size)
     for split in counts:

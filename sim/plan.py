@@ -43,7 +43,10 @@ def plan(family: SceneFamily) -> Plan:
     from sim.mpm.solver import MPMSimulator
 
     solver, model = MPMSimulator(), family.model
-    plans = [solver.plan(family.sample(trajectory_seed(0, "train", index))) for index in range(_SAMPLES)]
+    scenes = [family.sample(trajectory_seed(0, "train", index)) for index in range(_SAMPLES)]
+    for scene in scenes:
+        solver.check_time_step(scene, family.where)
+    plans = [solver.plan(scene) for scene in scenes]
     recorded, particles = (float(np.mean([each[key] for each in plans])) for key in ("recorded", "particles"))
     substeps = np.mean([each["substeps_per_frame"] for each in plans], axis=0)
     work = particles * float(substeps.mean()) * (model.frames - 1)
@@ -52,6 +55,16 @@ def plan(family: SceneFamily) -> Plan:
         solver=max(plans, key=lambda each: each["bytes"]), recorded=recorded, particles=particles, substeps=(round(substeps[0]), round(substeps[1])),
         particle_substeps=work, rate=rate, seconds=work / rate, disk=4.0 * model.frames * recorded * model.dim,
     )
+
+
+def check_time_step(family: SceneFamily, counts: dict[str, int], seed: int) -> None:
+    """Refuse a fixed time step that is above the limit at the start of any of these trajectories. Raises ``InputError``."""
+    from sim.mpm.solver import MPMSimulator
+
+    if family.model.time_step is not None:
+        for split, count in counts.items():
+            for index in range(count):
+                MPMSimulator().check_time_step(family.sample(trajectory_seed(seed, split, index), split), family.where)
 
 
 def check_budget(family: SceneFamily, trajectories: int, budget: float) -> None:

@@ -186,6 +186,8 @@ class _Physics(_Strict):
     refine: Annotated[int, Field(ge=1, le=8)] = 1
     jitter: Annotated[float, Field(ge=0, le=0.5)] = 0.0
     cfl: Annotated[float, Field(gt=0, le=4)] = 0.4
+    #: Fixed length of a substep [s], for runs that must share one; absent: as long as the limits allow, frame by frame.
+    time_step: Positive | None = None
     walls: Walls = Walls()
     materials: dict[str, Material]
     #: Material numbers ("material.key") that every frame's context repeats, after the container's acceleration if there is one.
@@ -193,9 +195,9 @@ class _Physics(_Strict):
 
     @model_serializer(mode="wrap")
     def _without_what_is_absent(self, handler) -> dict:
-        """A scene without obstacles, container or context reads as if there were no such thing."""
+        """A scene without time step, obstacles, container or context reads as if there were no such thing."""
         content = handler(self)
-        return {key: value for key, value in content.items() if key not in ("obstacles", "container", "context") or value}
+        return {key: value for key, value in content.items() if key not in ("time_step", "obstacles", "container", "context") or value}
 
     @property
     def grid_spacing(self) -> float:
@@ -222,6 +224,11 @@ class _Physics(_Strict):
         if self.radius < self.spacing:
             remedy = f"below the particle spacing {self.spacing:.6g}: no particle would have a neighbour; use at least {1.5 * self.spacing:.4g}"
             raise _mistake("radius", self.radius, remedy)
+        if self.time_step is not None:
+            steps = max(1, int(np.ceil(self.frame_step / self.time_step - 1e-6)))
+            if abs(steps * self.time_step - self.frame_step) > 1e-6 * self.frame_step:
+                remedy = f"must divide frame_step {self.frame_step:g}; {self.frame_step / steps:.8g} does, in {steps} steps"
+                raise _mistake("time_step", self.time_step, remedy)
         if not self.materials:
             raise _mistake("materials", {}, "name at least one material")
         for name, material in self.materials.items():
@@ -323,6 +330,12 @@ class Scene(_Physics):
     bodies: list[Body]
     obstacles: list[Obstacle] = []
     container: Container | None = None
+
+    @model_validator(mode="after")
+    def _not_empty(self) -> Scene:
+        if not self.bodies:
+            raise _mistake("bodies", [], "an empty scene: add at least one body")
+        return self
 
     def to_dict(self) -> dict:
         """Plain JSON, with the derived lengths beside the inputs for readers that are not this code."""

@@ -48,17 +48,21 @@ def _targets(study: Study, comparison: str, scene: str) -> list[Target]:
     return targets
 
 
-def _provenance(study: Study) -> dict:
+def how_to_repeat(study: Study) -> dict[str, str]:
     """How to make the report again, and of which revision it is where Git knows."""
     facts = {"study": str(study.path), "command": f"snakemake --config study={study.path}"}
     git = subprocess.run(["git", "describe", "--always", "--dirty", "--abbrev=12"], capture_output=True, text=True)
     if git.returncode == 0:
         facts["revision"] = git.stdout.strip()
+    return facts
+
+
+def _provenance(study: Study) -> dict:
     data = {
         name: {key: entry[key] for key in ("scene", "variant", "frames", "seed", "train", "valid", "test") if key in entry}
         for name, entry in study.data.items()
     }
-    return {"how to repeat": facts, "data": data, "models": study.models}
+    return {"how to repeat": how_to_repeat(study), "data": data, "models": study.models}
 
 
 def summarise(study: Study) -> dict:

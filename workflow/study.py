@@ -1,4 +1,4 @@
-"""Studies: one YAML file names data sets, models and comparisons; validated here, before anything runs.
+"""Studies: one YAML file names data sets, models and comparisons, or cases of the stress matrix; validated here, before anything runs.
 
 A study is chosen by ``--config study=FILE`` and read by us: Snakemake's own ``configfile`` is merged key by key with ``--configfile``, so
 that a small study would silently keep the scenes of a large one. Everything of a study is under ``results/<file's stem>/``.
@@ -21,6 +21,7 @@ from learn.compare import BEST_TRIVIAL
 from learn.metrics import CLOUD_METRICS, CLOUD_TIMES
 from sim.errors import InputError
 from sim.scene import SceneFamily, read_yaml
+from sim.stability import CASES
 from workflow.names import FLOOR, ORACLE, REFERENCE, TRIVIAL
 from workflow.sources import ROOT, code_hash, registered_models
 
@@ -84,6 +85,11 @@ class Study:
     @property
     def comparisons(self) -> dict[str, dict]:
         return self.content["comparisons"]
+
+    @property
+    def stability(self) -> dict[str, list[str]]:
+        """Cases of the stress matrix by job; empty in a study that compares."""
+        return self.content["stability"]
 
     # -- places
 
@@ -162,6 +168,16 @@ class Study:
         """Hash of what the report says beyond its input files: title, targets, settings, and its code and template."""
         return digest(self.content, code_hash("workflow.scripts.summary"), (ROOT / "learn" / "report_template.html").read_text())
 
+    def stress_recipe(self, job: str) -> str:
+        """Hash of the code that the cases of a job run."""
+        return code_hash("workflow.scripts.stress", *(f"sim.stability.{case}" for case in self.stability[job]))
+
+    def stability_recipe(self) -> str:
+        """Hash of what a stability report says beyond its input files."""
+        template = (ROOT / "sim" / "stability" / "report_template.html").read_text()
+        titles = [f"sim.stability.{case}" for cases in self.stability.values() for case in cases]
+        return digest(self.content, code_hash("workflow.scripts.stability_report", *titles), template)
+
     def budget(self, model: str) -> dict[str, float]:
         return {key: self.models[model][key] for key in ("minutes", "steps") if key in self.models[model]}
 
@@ -182,6 +198,14 @@ def load_study(path: str | Path) -> Study:
     if errors:
         # The deepest fault says most: a wrong type below beats "does not fit" above.
         raise _explain(max(errors, key=lambda error: len(error.absolute_path)), path)
+    content = {"data": {}, "models": {}, "comparisons": {}, "stability": {}} | content
+    known: set[str] = set()
+    for job, cases in content["stability"].items():
+        for index, case in enumerate(cases):
+            if case not in CASES or case in known:
+                remedy = "a job runs this case already; leave it out" if case in known else f"no such case; those are {', '.join(CASES)}"
+                raise InputError(path, f"stability.{job}[{index}]", case, remedy)
+            known.add(case)
     families, configs = {}, {}
     for name, entry in content["data"].items():
         content["data"][name] = entry = {"seed": 0, "train": 0, "valid": 0, "test": 0, **entry}

@@ -32,6 +32,9 @@ COURANT_GROWTH = 1.5
 #: Whole bodies bear more, so this binds at Courant numbers above 0.8 / sqrt(dim), where the volume of lone drops of water ran away.
 #: It is necessary, not sufficient: nothing damps a lone particle, and swings of 5 % may still grow until the trajectory fails.
 LONE_PARTICLE = 0.8
+#: Largest c dt / dx whatever Courant number is asked for. Sand, which does not ring, kept its energy up to 1.4 and gained it, unnoticed, from 2
+#: (``sim.stability``); what rings is held to less by ``LONE_PARTICLE``.
+LARGEST_COURANT = 1.4
 #: Halvings of the planned step before a trajectory is given up.
 MAX_HALVINGS = 6
 
@@ -614,25 +617,34 @@ class MPMSimulator:
     elastic moduli), ``coarsen`` (factor on the grid spacing of the recorded resolution; implies the recorded particles),
     ``particles`` ("teacher": refined as the scene says; "recorded": the tracked set alone, on the recorded grid),
     ``perturbation`` (length: random displacement of the start, for the chaos floor).
+
+    A scene's ``time_step`` holds unless ``cfl`` is given. ``unguarded_step`` [s] is for ``sim.stability`` alone: a fixed step that nothing
+    refuses or shortens, to see where the solver really becomes unstable.
     """
 
     def __init__(self, *, name: str = "mpm", kind: Kind = "reference", cfl: float | None = None, stiffness: float = 1.0, coarsen: float = 1.0,
-                 particles: str = "teacher", perturbation: float = 0.0, serial: bool | None = None):
+                 particles: str = "teacher", perturbation: float = 0.0, serial: bool | None = None,
+                 unguarded_step: float | None = None):
         if particles not in ("teacher", "recorded"):
             raise InputError(name, "particles", particles, "must be teacher or recorded")
         if particles == "teacher" and coarsen != 1.0:
             raise InputError(name, "coarsen", coarsen, "a coarser grid needs particles: recorded")
         self.name, self.kind = name, kind
         self.settings = {"cfl": cfl, "stiffness": stiffness, "coarsen": coarsen, "particles": particles, "perturbation": perturbation}
-        self.serial = serial
+        self.serial, self.unguarded_step = serial, unguarded_step
         self.compile_seconds = 0.0
         self._kernels: _Kernels | None = None
         self._scene: Scene | None = None
 
     # -- the state at frame 0
     def load(self, scene: Scene) -> None:
-        """Set the state of frame 0; allocates and compiles on first use of a structure (``compile_seconds``)."""
+        """Set the state of frame 0; allocates and compiles on first use of a structure (``compile_seconds``).
+
+        Raises ``InputError`` for a fixed time step above the limit at the start.
+        """
         begun = time.perf_counter()
+        if self.unguarded_step is None:
+            self.check_time_step(scene, scene.name)
         arch = start_taichi()
         serial = arch == "cpu" if self.serial is None else self.serial
         particles = scene.particles(self._refine(scene))
@@ -644,7 +656,7 @@ class MPMSimulator:
         kernels = self._kernels
         lower, upper = np.array(scene.bounds).T
         cells = self._cells(scene)
-        self.dx = float((upper[0] - lower[0]) / cells[0])
+        self.dx = self._spacing(scene)
         self._scene, self._tracked = scene, particles.tracked
         position = particles.position
         if self.settings["perturbation"]:
@@ -662,7 +674,7 @@ class MPMSimulator:
         if structure.rigid:
             kernels.load_rigid(body_table(scene, particles, data[:, : scene.dim].astype(float), self.dx, WALL, structure.rigid[1]))
         self._acceleration, self._frame, self._boundary = scene.acceleration(), 0, scene.boundary.astype(np.float32)
-        self._cfl, self._least = self.settings["cfl"] or scene.cfl, self._fewest(scene, self.dx)
+        self._cfl = self._courant(scene)
         self._position = np.zeros((len(position), scene.dim), np.float32)
         if fresh:
             # Compiles all that a frame needs; the tiny step is taken back.
@@ -722,16 +734,54 @@ class MPMSimulator:
         limits = (_power_of_two(len(rigid)), 6 if faces <= 6 else _power_of_two(faces)) if rigid else None
         return Structure(scene.dim, models, walls, obstacles, scene.container is not None, limits)
 
-    def _fewest(self, scene: Scene, dx: float) -> int:
-        """Substeps a frame that the materials' own bounds ask for."""
-        step = min(MODELS[material.model].largest_step(material, scene.dim, dx) for material in scene.materials.values())
-        return max(1, int(np.ceil(scene.frame_step / step)))
+    def _courant(self, scene: Scene) -> float:
+        return self.settings["cfl"] or scene.cfl
 
-    def _ringing(self, scene: Scene, dx: float, wave_speed: float) -> int:
-        """Substeps a frame that a lone particle asks for (``LONE_PARTICLE``); none where every material goes slack when it is parted."""
-        if not any(MODELS[material.model].rings(material) for material in scene.materials.values()):
-            return 0
-        return int(np.ceil(scene.frame_step * wave_speed * np.sqrt(scene.dim) / (LONE_PARTICLE * dx)))
+    def _rings(self, scene: Scene) -> bool:
+        """Whether some material resists when it is parted, so that a particle alone on the grid is an oscillator (``LONE_PARTICLE``)."""
+        return any(MODELS[material.model].rings(material) for material in scene.materials.values())
+
+    def _spacing(self, scene: Scene) -> float:
+        lower, upper = np.array(scene.bounds).T
+        return float((upper[0] - lower[0]) / self._cells(scene)[0])
+
+    def limits(self, scene: Scene, dx: float, wave_speed: float, speed: float) -> dict[str, float]:
+        """Bounds on the time step [s] on a grid of spacing dx, at a wave speed and a speed of particles [m/s], by what sets them:
+
+        cfl dx / (c + |v|); ``LARGEST_COURANT`` dx / c; dx^2 / (2 d nu), the viscosity of each viscous material;
+        ``LONE_PARTICLE`` dx / (sqrt(d) c).
+        """
+        tiny = np.finfo(float).tiny
+        found = {
+            "the Courant number": self._courant(scene) * dx / max(wave_speed + speed, tiny),
+            "sound across a cell": LARGEST_COURANT * dx / max(wave_speed, tiny),
+        }
+        for name, material in scene.materials.items():
+            found[f"the viscosity of {name}"] = MODELS[material.model].largest_step(material, scene.dim, dx)
+        if self._rings(scene):
+            found["a particle alone on the grid"] = LONE_PARTICLE * dx / max(np.sqrt(scene.dim) * wave_speed, tiny)
+        return found
+
+    def _at_start(self, scene: Scene, speed: float) -> tuple[float, float]:
+        """Wave speed of the unstrained materials, and ``speed`` with what gravity adds within the first frame."""
+        wave_speed = max(MODELS[material.model].rest_wave_speed(material, self.settings["stiffness"]) for material in scene.materials.values())
+        return wave_speed, speed + float(np.linalg.norm(np.array(scene.gravity) - scene.acceleration()[0])) * scene.frame_step
+
+    def check_time_step(self, scene: Scene, where: object) -> None:
+        """Refuse a fixed time step above the limit that the materials, at rest, and the bodies' own speeds set. Raises ``InputError``."""
+        if scene.time_step is None or self.settings["cfl"]:
+            return
+        wave_speed, speed = self._at_start(scene, max(float(np.linalg.norm(body.velocity)) for body in scene.bodies))
+        limits = self.limits(scene, self._spacing(scene), wave_speed, speed)
+        what = min(limits, key=limits.get)
+        if scene.time_step > limits[what] * (1 + 1e-6):
+            steps = int(np.ceil(scene.frame_step / limits[what]))
+            remedy = (
+                f"above the limit {limits[what]:.4g} s, which {what} sets (cfl {self._courant(scene):g}, {scene.dim}D, "
+                f"wave speed {wave_speed:.4g} m/s, speed {speed:.3g} m/s); use at most {scene.frame_step / steps:.8g}, "
+                f"{steps} steps a frame, or leave it out: adaptive"
+            )
+            raise InputError(where, "time_step", scene.time_step, remedy)
 
     def plan(self, scene: Scene) -> dict:
         """What ``load`` would build for a scene, without building it.
@@ -743,7 +793,7 @@ class MPMSimulator:
         dim, models, friction = structure.dim, structure.models, structure.friction
         particles, cells = scene.particles(self._refine(scene)), self._cells(scene)
         lower, upper = np.array(scene.bounds).T
-        dx = float((upper[0] - lower[0]) / cells[0])
+        dx = self._spacing(scene)
         n, nodes = _power_of_two(len(particles.position)), int(np.prod(cells + 2 * WALL + 1))
         particle_fields = {"x": dim, "v": 4, **{f"C{axis}": 4 for axis in range(dim)}}
         left_out = {"third dimension": "a 2D scene"} if dim == 2 else {}
@@ -777,19 +827,17 @@ class MPMSimulator:
             fields |= RigidBodies.sizes(dim, *structure.rigid, n, nodes)
             kernels[2:] = ["save", "spread_serial", "meet_rigid", "solve_rigid", "move_rigid", "collect_serial", "report_parallel", "load_rigid",
                            "keep_rigid"]
-        speeds = [MODELS[material.model].rest_wave_speed(material, self.settings["stiffness"]) for material in scene.materials.values()]
         gravity = float(np.linalg.norm(np.array(scene.gravity) - scene.acceleration(), axis=1).max())
         start = float(np.sqrt((particles.velocity**2).sum(1).max()))
         fall = float(np.sqrt(start**2 + 2 * gravity * np.linalg.norm(upper - lower)))
-        limit, fewest = (self.settings["cfl"] or scene.cfl) * dx, self._fewest(scene, dx)
-        fewest = max(fewest, self._ringing(scene, dx, max(speeds)))
-        substeps = [max(fewest, int(np.ceil(scene.frame_step * (max(speeds) + v + gravity * scene.frame_step) / limit))) for v in (0.0, fall)]
+        wave_speed, _ = self._at_start(scene, 0.0)
+        substeps = [self._substeps(scene, dx, wave_speed, v + gravity * scene.frame_step) for v in (0.0, fall)]
         return {
             "dim": dim, "materials": [name for name, *_ in models], "walls": friction, "obstacles": len(scene.obstacles),
             "context": 0 if context is None else context.shape[1], "kernels": kernels, "fields": fields, "left_out": left_out,
             "bytes": sum(size * count for size, count in fields.values()), "particles": len(particles.position),
             "recorded": len(particles.tracked) + len(scene.boundary), "kinematic": len(scene.boundary), "cells": cells.tolist(),
-            "grid_spacing": dx, "wave_speed": max(speeds), "substeps_per_frame": substeps,
+            "grid_spacing": dx, "wave_speed": wave_speed, "substeps_per_frame": substeps,
         }
 
     def _run(self, substeps: int, dt: float, keep: bool) -> np.ndarray:
@@ -802,31 +850,49 @@ class MPMSimulator:
         }
         return sums
 
+    def _fixed(self, scene: Scene) -> float | None:
+        """The fixed time step [s], None for an adaptive one."""
+        return self.unguarded_step or (None if self.settings["cfl"] else scene.time_step)
+
+    def _substeps(self, scene: Scene, dx: float, wave_speed: float, speed: float) -> int:
+        """Of a frame: as many as the fixed step asks for, else the fewest that obey the ``limits``."""
+        fixed = self._fixed(scene)
+        if fixed is not None:
+            return max(1, round(scene.frame_step / fixed))
+        return max(1, int(np.ceil(scene.frame_step / min(self.limits(scene, dx, wave_speed, speed).values()))))
+
     def frame(self) -> np.ndarray:
         """Advance one frame; positions of the recorded particles, kinematic ones last, [n, dim] float32. Raises ``SimulationError``.
 
-        dt <= cfl dx / (c + |v|) with the current wave speed and the speed that gravity can add within the frame, and the bounds of a
-        lone particle and of the materials (viscosity); substeps divide the frame exactly. A frame whose Courant number outgrew the
-        plan is taken back and repeated with half the step.
+        dt obeys the ``limits`` at the current wave speed, the current speed and what gravity can add to it within the frame; substeps
+        divide the frame exactly. A frame whose Courant number outgrew the plan is taken back and repeated with half the step; where the
+        step is fixed, it ends the trajectory.
         """
-        scene, known = self._scene, self._diagnostics
+        scene, known, fixed = self._scene, self._diagnostics, self._fixed(self._scene)
         felt = scene.gravity - self._acceleration[min(self._frame, len(self._acceleration) - 1)]
         reach = float(np.linalg.norm(felt)) * scene.frame_step
-        courant = int(np.ceil(scene.frame_step * (known["wave_speed"] + known["max_speed"] + reach) / (self._cfl * self.dx)))
-        substeps = max(self._least, courant, self._ringing(scene, self.dx, known["wave_speed"]))
-        for attempt in range(MAX_HALVINGS + 1):
+        substeps = self._substeps(scene, self.dx, known["wave_speed"], known["max_speed"] + reach)
+        for attempt in range(1 if fixed else MAX_HALVINGS + 1):
             dt = scene.frame_step / substeps
             sums = self._run(substeps, dt, keep=attempt == 0)
-            if np.isfinite(sums).all() and sums[6] == 0:
-                speed = float(np.sqrt(max(sums[3], sums[5])))
-                ring = self._ringing(scene, self.dx, sums[4]) and dt * sums[4] * np.sqrt(scene.dim) > self.dx
-                if dt * (speed + sums[4]) <= COURANT_GROWTH * self._cfl * self.dx and dt * speed <= self.dx and not ring:
-                    self._frame += 1
-                    return np.concatenate([self._position[self._tracked], self._boundary])
+            if self._acceptable(sums, dt):
+                self._frame += 1
+                return np.concatenate([self._position[self._tracked], self._boundary])
             if attempt < MAX_HALVINGS:
                 self._restore()
                 substeps *= 2
+        if fixed:
+            raise SimulationError(f"the fixed time step {dt:.3g} s gave no finite, stable frame")
         raise SimulationError(f"time step fell below {dt:.3g} s without a finite, stable frame")
+
+    def _acceptable(self, sums: np.ndarray, dt: float) -> bool:
+        """Whether a frame's ``SUMS`` are finite and, unless nothing guards the step, within the limits that it was planned for."""
+        if not np.isfinite(sums).all() or sums[6]:
+            return False
+        speed, wave_speed = float(np.sqrt(max(sums[3], sums[5]))), sums[4]
+        steady = dt * (speed + wave_speed) <= COURANT_GROWTH * self._cfl * self.dx and dt * speed <= self.dx
+        rings = self._rings(self._scene) and dt * wave_speed * np.sqrt(self._scene.dim) > self.dx
+        return self.unguarded_step is not None or (steady and not rings)
 
     def _restore(self) -> None:
         self._kernels.restore()
@@ -855,6 +921,25 @@ class MPMSimulator:
         lanes[:n, :dim], lanes[:n, dim] = velocity, 1.0
         kernels.v.from_numpy(lanes)
         self._run(0, 0.0, keep=True)
+
+    def inject(self, name: str, particle: int, value) -> None:
+        """Overwrite what ``state`` gives for one particle under a name (a material's: counted within it), positions in cells. For studies of
+        what happens then."""
+        kernels, dim = self._kernels, self._scene.dim
+        if name == "velocity gradient":
+            fields = [(kernels.C[axis], slice(dim), column) for axis, column in enumerate(np.broadcast_to(value, (dim, dim)).T)]
+        elif name in ("position", "velocity"):
+            fields = [({"position": kernels.x, "velocity": kernels.v}[name], slice(dim), value)]
+        else:
+            stuff, key = name.split(".")
+            m = list(self._scene.materials).index(stuff)
+            particle += int(kernels.range.to_numpy()[m])
+            state = list(MODELS[self._scene.materials[stuff].model].state(dim))
+            fields = [(kernels.materials[m].fields()[state.index(key)], Ellipsis, value)]
+        for field, lanes, content in fields:
+            whole = field.to_numpy()
+            whole[particle, lanes] = content
+            field.from_numpy(whole)
 
     def diagnostics(self) -> dict[str, float]:
         """Energies [J per unit depth in 2D], max speed and wave speed [m/s], substeps and dt [s] of the current frame."""

@@ -7,6 +7,7 @@ import yaml
 from study_tree import ROOT, make_tree, planned, snakemake
 
 from sim.errors import InputError
+from sim.stability import CASES
 from workflow.study import load_study
 
 
@@ -47,7 +48,7 @@ def drop(*keys):
 
 COMPARISON = ("comparisons", "puddle")
 MISTAKES = [
-    (put("colour", value=1), "colour = 1: unknown key; the keys here are comparisons, data, models, title"),
+    (put("colour", value=1), "colour = 1: unknown key; the keys here are comparisons, data, models, stability, title"),
     (put("data", "puddle", "tests", value=3), "data.puddle.tests = 3: unknown key"),
     (put("data", "puddle", "train", value="two"), "data.puddle.train = 'two': must be of type integer"),
     (put("data", "puddle", "train", value=-1), "data.puddle.train = -1"),
@@ -80,6 +81,7 @@ MISTAKES = [
     (drop(*COMPARISON, "targets", 0, "at"), "targets[0].at = None: rollout_mse_moving is known at"),
     (put(*COMPARISON, "targets", 0, "metric", value="emd"), "targets[0].at = 'all': emd is known at 0.25, 0.5, 0.75, 1"),
     (put(*COMPARISON, "targets", 0, "metric", value="escaped_fraction"), "targets[0].at = 'all': escaped_fraction is one figure; leave it out"),
+    (put("stability", value={"a": ["rest"]}), "a study of stability has title and stability alone"),
     (lambda content: content["comparisons"].update(again=content["comparisons"]["puddle"]), "two comparisons share this one"),
 ]
 
@@ -89,6 +91,21 @@ def test_mistakes_are_named(place, monkeypatch, change, line):
     monkeypatch.chdir(place)
     with pytest.raises(InputError) as error:
         load_study(write(place, change))
+    assert line in str(error.value) and "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(("stability", "line"), [
+    ({"a": ["rest", "unrest"]}, "stability.a[1] = 'unrest': no such case; those are young_dt, speed_dt"),
+    ({"a": ["rest"], "b": ["rest"]}, "stability.b[0] = 'rest': a job runs this case already"), ({"a": []}, "stability.a = []"),
+    ({"A job": ["rest"]}, "use small letters"), ({"a": "rest"}, "stability.a = 'rest': must be of type array"), ({}, "stability = []"),
+    (["rest"], "stability = ['rest']: must be of type object"),
+])  # fmt: skip
+def test_mistakes_in_a_stability_study_are_named(place, monkeypatch, stability, line):
+    monkeypatch.chdir(place)
+    path = Path("configs/studies/odd.yaml")
+    path.write_text(yaml.safe_dump({"title": "Odd", "stability": stability}))
+    with pytest.raises(InputError) as error:
+        load_study(path)
     assert line in str(error.value) and "\n" not in str(error.value)
 
 
@@ -123,7 +140,7 @@ def test_a_mistake_is_one_line_exit_2_and_nothing_written(tree):
 
 
 @pytest.mark.workflow
-@pytest.mark.parametrize("name", sorted(path.stem for path in (ROOT / "configs" / "studies").glob("*.yaml")))
+@pytest.mark.parametrize("name", sorted(path.stem for path in (ROOT / "configs" / "studies").glob("*.yaml") if path.stem != "stability"))
 def test_shipped_studies_resolve(place, name):
     jobs = planned(place, study=f"configs/studies/{name}.yaml")
     content = yaml.safe_load((place / "configs" / "studies" / f"{name}.yaml").read_text())
@@ -131,6 +148,13 @@ def test_shipped_studies_resolve(place, name):
     assert all(len(entry["ladder"]) >= 5 for entry in comparisons)
     assert jobs["errors"] == jobs["timing"] == jobs["figures"] == len(comparisons) and jobs["report"] == 1
     assert jobs.get("train", 0) == sum(len(model.get("seeds", [])) for model in models)
+
+
+@pytest.mark.workflow
+def test_the_stability_study_runs_every_case(place):
+    jobs = planned(place, study="configs/studies/stability.yaml")
+    study = yaml.safe_load((place / "configs" / "studies" / "stability.yaml").read_text())["stability"]
+    assert jobs == {"stress": len(study), "report": 1} and sorted(sum(study.values(), [])) == sorted(CASES)
 
 
 def test_the_paper_study_is_the_papers_size():

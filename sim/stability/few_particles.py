@@ -1,0 +1,66 @@
+"""Hardly anything in the box: a film one particle thick, one particle, no particle."""
+
+import time
+
+import numpy as np
+
+from sim.errors import InputError
+from sim.scene import Scene, SceneFamily
+from sim.stability import Cell
+from sim.stability.driver import ROUGH, follow
+from sim.stability.refusal import FAMILY
+from sim.validation import scene
+
+CELLS, G, FRAME = 16, 9.8, 0.005
+WATER = {"model": "water", "sound_speed": 20.0}
+#: Of positions, as 33 cells in float32 round them, some hundred steps.
+ROUNDING = 1e-4
+
+
+def run() -> list[Cell]:
+    """In 2D; the parabola is that of symplectic Euler at the steps taken, x0 + v0 t + g t^2 / 2 + g dt t / 2 a frame."""
+    film = [{"kind": "box", "lower": [0.25, 0.75], "upper": [0.75, 0.75 + 0.5 / CELLS], "velocity": [0.5, 0.0]}]
+    one = [{"kind": "box", "lower": [0.5, 0.5], "upper": [0.5 + 0.5 / CELLS] * 2, "velocity": [0.5, 1.0]}]
+    return [_flies("a film one particle thick", film, 50), _flies("one particle", one, 50), _rests(one), _empty()]
+
+
+def _scene(bodies: list[dict]) -> Scene:
+    return scene("few-particles", WATER, bodies, [[0.0, 1.0]] * 2, [CELLS] * 2, FRAME, gravity=[0.0, -G], walls=ROUGH)
+
+
+def _flies(cell: str, bodies: list[dict], frames: int) -> Cell:
+    begun, what = time.perf_counter(), _scene(bodies)
+    run, start = follow(what, frames), what.particles()
+    exact, velocity, g = start.position.copy(), start.velocity.copy(), np.array([0.0, -G])
+    for n, dt in zip(run.substeps, run.dt, strict=True):
+        exact += velocity * n * dt + g * dt**2 * n * (n + 1) / 2
+        velocity += g * n * dt
+    error = float(np.abs(run.position - exact).max()) if run.ok else np.inf
+    inside = bool(exact.min() > 2 / CELLS)
+    return Cell("few_particles", cell, run.ok and inside and error <= ROUNDING, "ballistic: the exact parabola to rounding",
+                f"{len(exact)} particles, at most {error:.2g} m off" if run.ok else run.status,
+                {"particles": len(exact), "error": error, "tolerance": ROUNDING}, time.perf_counter() - begun)  # fmt: skip
+
+
+def _rests(bodies: list[dict]) -> Cell:
+    begun = time.perf_counter()
+    run = follow(_scene(bodies), 400)
+    x, speed = run.position[0], float(run.speed[-1]) if run.ok else np.nan
+    # Within what gravity adds in a frame.
+    right = run.ok and 0 <= x[1] <= 1 / CELLS and 0 <= x[0] <= 1 and speed <= G * FRAME
+    return Cell("few_particles", "one particle, two seconds on", right, "rests on the floor, inside the walls",
+                f"at height {x[1]:.3g} m, speed {speed:.3g} m/s" if run.ok else run.status, {"height": float(x[1]), "speed": speed},
+                time.perf_counter() - begun, {"one particle": run.energy_curve(run.energy[0])})  # fmt: skip
+
+
+def _empty() -> Cell:
+    begun, said = time.perf_counter(), []
+    for make in (lambda: _scene([]), lambda: SceneFamily(FAMILY | {"materials": {"stuff": WATER}, "bodies": []}, "empty.yaml")):
+        try:
+            make()
+            said.append("accepted")
+        except InputError as error:
+            said.append(str(error))
+    right = all("bodies = []: an empty scene: add at least one body" in line for line in said)
+    return Cell("few_particles", "no particle", right, "refused in one line that says what is missing", said[0], {"said": said[1]},
+                time.perf_counter() - begun)  # fmt: skip

@@ -1,0 +1,49 @@
+"""Impact at 50 sqrt(g H): the step falls, nothing goes through walls or a thin plate, kinetic energy never exceeds what was brought in."""
+
+import time
+
+import numpy as np
+
+from sim.obstacles import combine
+from sim.stability import Cell
+from sim.stability.driver import ROUGH, follow, solver_for
+from sim.validation import scene
+
+MATERIALS = {
+    "water": {"model": "water", "sound_speed": 20.0},
+    "sand": {"model": "sand", "young_modulus": 3e5, "friction_angle": 30.0},
+    "elastic": {"model": "elastic", "young_modulus": 1e7},
+}
+#: Rubber that such an impact crushes to less of its volume than float32 can tell from nothing, were all its energy to go there.
+SOFT = {"model": "elastic", "young_modulus": 1e5}
+EXPECTED = "dt falls below that at rest, every particle stays inside, kinetic + potential energy never above the start's"
+CELLS, G, H = 16, 9.8, 0.5
+SPEED = 50 * np.sqrt(G * H)
+PLATE = {"kind": "segment", "start": [0.0, 0.25], "end": [1.0, 0.25], "thickness": 2.0 / CELLS}
+TARGETS = {"floor": [], "plate": [PLATE]}
+
+
+def run() -> list[Cell]:
+    """Each material thrown at the floor, and at a plate two cells thick; and one that may not bear it."""
+    return [_thrown(name, MATERIALS[name], target, obstacles) for name in MATERIALS for target, obstacles in TARGETS.items()] + [
+        _thrown("elastic, far too soft,", SOFT, "plate", TARGETS["plate"], may_fail=True)]
+
+
+def _thrown(name: str, material: dict, target: str, obstacles: list, may_fail: bool = False) -> Cell:
+    begun, cell = time.perf_counter(), f"{name} on a {target}"
+    body = {"kind": "box", "lower": [0.375, 0.5], "upper": [0.625, 0.75], "velocity": [0.0, -SPEED]}
+    what = scene("impact", material, [body], [[0.0, 1.0]] * 2, [CELLS] * 2, 5e-4, gravity=[0.0, -G], obstacles=obstacles, walls=ROUGH)
+    run = follow(what, 60)
+    rest = 0.4 / CELLS / (float(solver_for(what).plan(what)["wave_speed"]) + G * what.frame_step)
+    x = run.position[: len(what.particles().position)]
+    held = bool((x >= 0).all() and (x <= 1).all())
+    if obstacles:
+        held = held and float(combine(what.obstacles, x)[0].min()) > -1e-3 / CELLS and bool((x[:, 1] > 0.25).all())
+    top, smallest = float((run.kinetic / run.energy[0]).max(initial=0.0)), float(run.dt.min(initial=np.inf))
+    right = (run.ok or may_fail) and held and top <= 1 and smallest < rest
+    where = "all inside" if held else "some outside"
+    observed = f"dt {rest:.2g} s at rest, {smallest:.2g} s here; {where}; kinetic energy at most {top:.4g} of the start's"
+    expected = EXPECTED + ("; or failed and said so" if may_fail else "")
+    numbers = {"speed": SPEED, "rest_dt": rest, "smallest_dt": smallest, "kinetic_over_start": top, "energy_growth": run.growth(run.energy[0])}
+    return Cell("impact", cell, right, expected, observed if run.ok else f"{run.status}; until then: {observed}", numbers,
+                time.perf_counter() - begun, {cell: run.energy_curve(run.energy[0])})  # fmt: skip

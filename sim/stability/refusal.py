@@ -1,0 +1,56 @@
+"""Fixed time steps above the limit: plan and generate refuse them in one line that names the limit and what sets it."""
+
+from __future__ import annotations
+
+import copy
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from sim.stability import Cell
+from sim.stability.command_line import command
+
+EXPECTED = "exit code 2, one line with file, key, value, the limit and what sets it, nothing written; accepted at the limit"
+FRAME, CELLS = 0.01, 16
+FAMILY = {
+    "name": "refusal", "dim": 2, "bounds": [[0.0, 1.0], [0.0, 1.0]], "gravity": [0.0, 0.0], "frame_step": FRAME, "frames": 3, "radius": 0.1,
+    "cells": [CELLS, CELLS], "bodies": [{"material": "stuff", "shape": {"kind": "box", "size": [0.25, 0.25]}}],
+    "splits": {"train": 2, "valid": 0, "test": 0},
+}
+#: What binds -> (materials, cfl, velocity, limit by hand [s]).
+BINDING = {
+    "the Courant number": ({"model": "water", "sound_speed": 20.0}, 0.4, 5.0, 0.4 / CELLS / 25.0),
+    "the viscosity of stuff": ({"model": "water", "sound_speed": 5.0, "viscosity": 2000.0}, 0.4, 0.0, 1 / CELLS**2 * 1000.0 / (2 * 2 * 2000.0)),
+    "a particle alone on the grid": ({"model": "water", "sound_speed": 20.0}, 2.0, 0.0, 0.8 / CELLS / (np.sqrt(2) * 20.0)),
+}
+
+
+def run() -> list[Cell]:
+    """Each of the three limits, just above and just below."""
+    cells = []
+    for what, (material, cfl, speed, limit) in BINDING.items():
+        begun = time.perf_counter()
+        with tempfile.TemporaryDirectory() as place:
+            path, out = Path(place) / "refusal.yaml", Path(place) / "out"
+            steps = int(np.ceil(FRAME / limit))
+
+            def write(count: int, path=path, material=material, cfl=cfl, speed=speed) -> None:
+                content = copy.deepcopy(FAMILY) | {"materials": {"stuff": material}, "cfl": cfl, "time_step": FRAME / count}
+                content["bodies"][0]["velocity"] = [speed, 0.0]
+                path.write_text(yaml.safe_dump(content))
+
+            write(steps - 1)
+            answers = [command("plan", path), command("generate", path, "--out", out)]
+            parts = (str(path), "time_step = ", f"limit {limit:.4g} s, which {what} sets")
+            refused = all(code == 2 and said.count("\n") == 1 and all(part in said for part in parts) for code, said in answers)
+            left = sorted(each.name for each in Path(place).iterdir()) == ["refusal.yaml"]
+            write(steps)
+            accepted = command("plan", path)[0] == 0
+        observed = f"above: exit {', '.join(str(code) for code, _ in answers)}, {'nothing' if left else 'something'} written; below: " + (
+            "accepted" if accepted else "refused")  # fmt: skip
+        numbers = {"limit": limit, "time_step": FRAME / (steps - 1), "said": answers[0][1].strip().replace(str(path), "refusal.yaml")}
+        cells.append(Cell("refusal", what, refused and left and accepted, EXPECTED, observed, numbers, time.perf_counter() - begun))
+    return cells

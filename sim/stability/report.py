@@ -1,0 +1,161 @@
+"""What the cells of the stress matrix say together: a summary (rows and a verdict in words) and one self-contained page with pictures."""
+
+from __future__ import annotations
+
+import base64
+import importlib
+import io
+import math
+from collections.abc import Mapping, Sequence
+from itertools import groupby
+from pathlib import Path
+
+import jinja2
+import numpy as np
+
+from sim.stability import BOUND, Cell
+from sim.trajectory import atomic_path
+
+#: Points of a curve in the summary: more show nothing on a page.
+_POINTS = 200
+_OUTCOMES = {"bounded": "energy bounded", "grew": "energy grew", "not finite": "failed and said so"}
+_COLOURS = {"bounded": "C0", "grew": "C1", "not finite": "C3"}
+#: Case -> (key of its map's other axis, that axis' name).
+MAPS = {"young_dt": ("young_modulus", "Young's modulus E [Pa]"), "speed_dt": ("speed", "speed v [m/s]")}
+
+
+def _plain(value):
+    """JSON's own numbers; None for what is not finite."""
+    if isinstance(value, bool | np.bool_):
+        return bool(value)
+    if isinstance(value, int | float | np.number):
+        return float(value) if math.isfinite(value) else None
+    return value
+
+
+def row(cell: Cell) -> dict:
+    """A cell as it stands in ``summary.json``."""
+    curves = {}
+    for name, series in cell.curves.items():
+        chosen = np.unique(np.linspace(0, len(series.x) - 1, _POINTS).astype(int))
+        curves[name] = {"axes": list(series.axes), **{key: [_plain(each) for each in getattr(series, key)[chosen]] for key in ("x", "y")}}
+    return {
+        "case": cell.case, "cell": cell.cell, "right": bool(cell.right), "expected": cell.expected, "observed": cell.observed,
+        "numbers": {key: _plain(value) for key, value in cell.numbers.items()}, "seconds": cell.seconds, "curves": curves,
+    }
+
+
+def title(case: str) -> str:
+    """First line of a case's docstring."""
+    return importlib.import_module(f"sim.stability.{case}").__doc__.splitlines()[0].rstrip(".")
+
+
+def onset(rows: Sequence[Mapping]) -> float:
+    """The smallest refused step of a map that was not bounded, over its limit."""
+    steps = [one["numbers"] for one in rows if one["numbers"].get("refused")]
+    return min((one["time_step"] / one["limit"] for one in steps if one["outcome"] != "bounded"), default=math.inf)
+
+
+def verdict(rows: Sequence[Mapping]) -> str:
+    """In words: how many cells react rightly, which do not, and how far the limits of the time step are from what they guard against."""
+    wrong = [one for one in rows if not one["right"]]
+    cases = len({one["case"] for one in rows})
+    count = f"All {len(rows)} cells of {cases} cases" if not wrong else f"{len(rows) - len(wrong)} of {len(rows)} cells of {cases} cases"
+    text = f"{count} react as they should."
+    if wrong:
+        named = [f"{one['case'].replace('_', ' ')}, {one['cell']} ({one['observed']})" for one in wrong]
+        text += f" Wrong: {'; '.join(named)}."
+    for case in MAPS:
+        cells = [one for one in rows if one["case"] == case]
+        accepted = [one["numbers"]["outcome"] for one in cells if one["numbers"].get("refused") is False]
+        if cells:
+            text += (
+                f" {title(case).split(':')[0]}: {len(accepted)} fixed steps were accepted, of which {accepted.count('grew')} gained energy unnoticed "
+                f"and {accepted.count('not finite')} failed and said so; of those refused, run all the same, the first to go wrong was "
+                f"{onset(cells):.2g} times the limit."
+            )
+    return text
+
+
+def map_figure(rows: Sequence[Mapping], case: str):
+    """A map: every fixed step by what became of the energy, filled where it was accepted; the limits; the steps of the adaptive run."""
+    from matplotlib.figure import Figure
+
+    key, name = MAPS[case]
+    figure = Figure(figsize=(8, 5.2), layout="constrained")
+    panel = figure.subplots()
+    fixed = [one["numbers"] for one in rows if one["case"] == case and "courant" in one["numbers"]]
+    for refused, outcome in ((refused, outcome) for refused in (False, True) for outcome in _COLOURS):
+        chosen = [one for one in fixed if one["refused"] == refused and one["outcome"] == outcome]
+        if chosen:
+            colour = _COLOURS[outcome]
+            panel.plot([one[key] for one in chosen], [one["time_step"] for one in chosen], "s", ms=5, color=colour,
+                       mfc="none" if refused else colour, label=f"{'refused' if refused else 'accepted'}; {_OUTCOMES[outcome]}")  # fmt: skip
+    columns = {one[key]: one for one in fixed}
+    x = sorted(columns)
+    panel.plot(x, [columns[each]["limit"] for each in x], "k-", lw=1.5, label="limit of the solver, 0.4 dx / (c + v)")
+    panel.plot(x, [columns[each]["time_step"] / columns[each]["courant"] for each in x], "k--", lw=1.2, label="dx / (c + v)")
+    adaptive = [one["numbers"] for one in rows if one["case"] == case and "courant" not in one["numbers"]]
+    at = np.array([one[key] for one in adaptive])
+    low, high = (np.array([one[name] for one in adaptive], float) for name in ("smallest_dt", "largest_dt"))
+    if len(at):
+        panel.errorbar(at * 1.13, high, yerr=[high - low, 0 * high], fmt="_", color="C2", ms=8, capsize=3,
+                       label="adaptive run: largest to smallest step")  # fmt: skip
+    panel.set(xscale="log", yscale="log", xlabel=name, ylabel="time step dt [s]")
+    panel.legend(fontsize=8)
+    return figure
+
+
+def curve_figure(rows: Sequence[Mapping]):
+    """Energy over time of the cells of one case."""
+    from matplotlib import colormaps
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8, 3.6), layout="constrained")
+    panel = figure.subplots()
+    curves = [(name, curve) for one in rows for name, curve in one["curves"].items()]
+    for index, (name, curve) in enumerate(curves):
+        end = curve["x"][-1] or 1.0
+        colour = f"C{index}" if len(curves) <= 10 else colormaps["viridis"](index / (len(curves) - 1))
+        panel.plot(np.array(curve["x"]) / end, curve["y"], lw=1.2, color=colour, label=name)
+    panel.axhline(BOUND, color="C3", ls=":", lw=1.2, label="bound")
+    low, high = panel.get_ylim()
+    panel.set(xlabel="time / duration of the run", ylabel="energy at hand / the start's", ylim=(min(0.0, low), max(1.6, high)))
+    figure.legend(fontsize=7, loc="outside right upper", ncols=1 if len(curves) <= 18 else 2)
+    return figure
+
+
+def _uri(figure) -> str:
+    data = io.BytesIO()
+    figure.savefig(data, format="svg")
+    return f"data:image/svg+xml;base64,{base64.b64encode(data.getvalue()).decode()}"
+
+
+def _shown(numbers: Mapping) -> str:
+    parts = [f"{key.replace('_', ' ')} {value:.4g}" if isinstance(value, float) else f"{key.replace('_', ' ')}: {value}"
+             for key, value in numbers.items() if value is not None]  # fmt: skip
+    return ", ".join(parts)
+
+
+def write_report(summary: Mapping, path: str | Path) -> None:
+    """Write the page, complete or not at all. summary: "title", "verdict" (the first paragraph), "rows", "hardware", "versions", "provenance"."""
+    sections = []
+    for case, members in groupby(summary["rows"], key=lambda one: one["case"]):
+        rows, pictures = list(members), []
+        if case in MAPS:
+            pictures.append((_uri(map_figure(rows, case)), "Each mark is a run at a fixed time step. What is refused was run all the same."))
+        if any(one["curves"] for one in rows):
+            pictures.append((_uri(curve_figure(rows)), "Kinetic, potential and elastic energy, over what there is to release; 1 at the start."))
+        wrong = sum(not one["right"] for one in rows)
+        # The cells of a map are told by its picture; the table holds those that went wrong and the adaptive runs.
+        listed = [one for one in rows if not one["right"] or "courant" not in one["numbers"]] if case in MAPS else rows
+        sections.append({"title": title(case), "rows": listed, "pictures": pictures, "cells": len(rows), "wrong": wrong,
+                         "seconds": sum(one["seconds"] for one in rows)})  # fmt: skip
+    loader = jinja2.FileSystemLoader(Path(__file__).parent)
+    environment = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    page = environment.get_template("report_template.html").render(
+        title=summary["title"], verdict=summary["verdict"], sections=sections, shown=_shown,
+        provenance={name: summary[name] for name in ("hardware", "versions", "provenance")},
+    )
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(page.encode())

@@ -1,0 +1,35 @@
+"""No gravity, no motion: a block of each material stays where it is for ten thousand steps."""
+
+import time
+
+import numpy as np
+
+from sim.stability import Cell
+from sim.stability.courant import MATERIALS
+from sim.stability.driver import ROUGH, follow, solver_for
+from sim.validation import scene
+
+STEPS, CELLS = 10_000, 16
+#: Speed that is rounding alone: eps of the speed of sound a step, a random walk over all of them.
+EPS = float(np.finfo(np.float32).eps)
+
+
+def run() -> list[Cell]:
+    """The lattice is jittered, so that nothing is symmetric."""
+    cells = []
+    for name, material in MATERIALS.items():
+        begun = time.perf_counter()
+        body = {"kind": "box", "lower": [0.375, 0.375], "upper": [0.625, 0.625]}
+        what = scene("rest", material, [body], [[0.0, 1.0]] * 2, [CELLS] * 2, 0.01, jitter=0.2, walls=ROUGH)
+        solver = solver_for(what)
+        solver.load(what)
+        tolerance = EPS * solver.diagnostics()["wave_speed"] * np.sqrt(STEPS)
+        frames = int(np.ceil(STEPS / solver.plan(what)["substeps_per_frame"][0]))
+        run = follow(what, frames)
+        steps, fastest = float(run.substeps.sum()), float(run.speed.max(initial=0.0))
+        moved = float(np.abs(run.position - what.start()).max())
+        right = run.ok and steps >= STEPS and fastest <= tolerance
+        observed = f"{steps:.0f} steps, at most {fastest:.2g} m/s, moved {moved:.2g} m" if run.ok else run.status
+        numbers = {"steps": steps, "speed": fastest, "tolerance": float(tolerance), "moved": moved}
+        cells.append(Cell("rest", name, right, "speed at round-off", observed, numbers, time.perf_counter() - begun))
+    return cells

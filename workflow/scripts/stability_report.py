@@ -1,0 +1,23 @@
+"""``summary.json`` and ``report.html`` of a stability study. ``python -m workflow.scripts.stability_report STUDY SUMMARY REPORT CELLS ...``"""
+
+import json
+import sys
+from pathlib import Path
+
+from sim.stability.report import verdict, write_report
+from sim.trajectory import write_json
+from workflow.results import how_to_repeat
+from workflow.study import load_study
+
+
+def main(path: str, out: str, report: str, *cells: str) -> None:
+    study, found = load_study(path), [json.loads(Path(each).read_text()) for each in cells]
+    rows = [row for each in found for row in each["rows"]]
+    summary = {"title": study.content["title"], "verdict": verdict(rows), "rows": rows, "provenance": how_to_repeat(study)}
+    summary |= {key: found[0][key] for key in ("hardware", "versions")}
+    write_json(out, summary)
+    write_report(summary, report)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
