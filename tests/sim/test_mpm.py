@@ -474,7 +474,9 @@ def test_not_a_number_is_caught_within_its_frame(request, field, material, value
             return solver.frame()
 
     trajectory = simulate(Poisoned(), what)
-    assert trajectory.status.startswith("failed: time step fell below") and trajectory.status.endswith("(frame 4)")
+    known = {"velocity": "velocity", "gradient": "velocity gradient", "material": {"water": "water.J", "sand": "sand.b - I"}[material]}[field]
+    why = "time step fell below" if np.isfinite(value) else f"{known} of particle 17 is not finite (frame 4)"
+    assert trajectory.status.startswith(f"failed: {why}") and trajectory.status.endswith("(frame 4)")
     assert len(trajectory.position) == 4 and np.isfinite(trajectory.position).all(), "the frames before it are kept"
 
 
