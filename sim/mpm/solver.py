@@ -63,6 +63,12 @@ def _power_of_two(n: int) -> int:
     return 1 << max(int(n) - 1, 15).bit_length()
 
 
+def _capacity(particles: int) -> int:
+    """Particles that fields are made for: few different numbers, for each compiles anew, yet of many particles no more than an eighth in vain."""
+    step = _power_of_two(particles) >> (4 if particles > 1 << 14 else 0)
+    return -(-max(particles, 1) // step) * step
+
+
 @ti.data_oriented
 class _Kernels:
     """Fields and compiled code for one ``Structure``; capacities in particles and nodes.
@@ -645,7 +651,7 @@ class MPMSimulator:
         serial = arch == "cpu" if self.serial is None else self.serial
         particles = scene.particles(self._refine(scene))
         structure, nodes = self._structure(scene), tuple(int(c) + 2 * WALL + 1 for c in self._cells(scene))
-        capacity = _power_of_two(len(particles.position))
+        capacity = _capacity(len(particles.position))
         old, fresh = self._kernels, False
         if old is None or old.structure != structure or old.nodes != nodes or old.capacity < capacity:
             self._kernels, fresh = _Kernels(structure, capacity, nodes, serial), True
@@ -752,7 +758,7 @@ class MPMSimulator:
         particles, cells = scene.particles(self._refine(scene)), self._cells(scene)
         lower, upper = np.array(scene.bounds).T
         dx = float((upper[0] - lower[0]) / cells[0])
-        n, nodes = _power_of_two(len(particles.position)), int(np.prod(cells + 2 * WALL + 1))
+        n, nodes = _capacity(len(particles.position)), int(np.prod(cells + 2 * WALL + 1))
         particle_fields = {"x": dim, "v": 4, **{f"C{axis}": 4 for axis in range(dim)}}
         left_out = {"third dimension": "a 2D scene"} if dim == 2 else {}
         for name, material in scene.materials.items():

@@ -57,40 +57,45 @@ def command(scene, out):
 def test_kill_9_at_twenty_instants(tmp_path):
     """Twenty kills of the real command at random instants, resumed each time, beside a run that nobody disturbed.
 
-    Instants are drawn over the undisturbed run's time; a run that ends before its instant is compared, and another one begins.
+    A quarter of the instants lie before the first shard of a run, the others in what it has left to do. A run that ends before its
+    instant is compared, and another one begins.
     """
     scene, unbroken, folder = tmp_path / "mixed.yaml", tmp_path / "unbroken", tmp_path / "broken"
     scene.write_text(yaml.safe_dump(MIXED))
     # A cache of its own: a kill may leave that of the other tests locked.
     environment = os.environ | {"PYTHONPATH": str(HERE.parent.parent), "SLUICE_TAICHI_CACHE": str(tmp_path / "cache")}
 
-    def finish(out):
-        begun = time.monotonic()
-        subprocess.run(command(scene, out), env=environment, check=True, capture_output=True)
-        return time.monotonic() - begun
-
-    finish(tmp_path / "warm")
-    duration = finish(unbroken)
-    expected, content = shards(unbroken), without_cost(unbroken)
-    assert len(expected) == 16 and shards(tmp_path / "warm") == expected
-    rng, finished = np.random.default_rng(20), []
-    while len(finished) < 20:
+    def start(out):
         silent = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-        process = subprocess.Popen(command(scene, folder), env=environment, start_new_session=True, **silent)
+        return subprocess.Popen(command(scene, out), env=environment, start_new_session=True, **silent)
+
+    assert start(tmp_path / "warm").wait() == 0
+    begun, first, process = time.monotonic(), None, start(unbroken)
+    while process.poll() is None:
+        time.sleep(0.01)
+        first = first or (time.monotonic() - begun if shards(unbroken) else None)
+    working = time.monotonic() - begun - first
+    expected, content = shards(unbroken), without_cost(unbroken)
+    assert process.returncode == 0 and len(expected) == 16 and shards(tmp_path / "warm") == expected
+    rng, stages = np.random.default_rng(20), []
+    while len(stages) < 20:
+        left = 1 - len(shards(folder)) / 16
+        instant = rng.uniform(0, first) if len(stages) % 4 == 0 else first + rng.uniform(0, working) * left
+        process = start(folder)
         try:
-            assert process.wait(timeout=rng.uniform(0, duration)) == 0
+            assert process.wait(timeout=instant) == 0
         except subprocess.TimeoutExpired:
             os.killpg(process.pid, signal.SIGKILL)
             process.wait()
             present = shards(folder)
-            finished.append(len(present))
+            stages.append(len(present))
             assert present.items() <= expected.items(), "what is there is finished, to the last byte"
         else:
-            assert shards(folder) == expected and without_cost(folder) == content
-            folder = tmp_path / f"broken-{len(finished)}"
-    finish(folder)
+            assert shards(folder) == expected and without_cost(folder) == content and not hidden(folder)
+            folder = tmp_path / f"broken-{len(stages)}"
+    assert start(folder).wait() == 0
     assert shards(folder) == expected and without_cost(folder) == content and not hidden(folder)
-    assert len(set(finished)) >= 4, f"the kills met too few stages to mean much: {finished}"
+    assert len(set(stages)) >= 6, f"the kills met too few stages to mean much: {stages}"
 
 
 # -- numbers

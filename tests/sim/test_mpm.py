@@ -636,9 +636,14 @@ def test_water_compiles_no_decomposition(monkeypatch):
         MPMSimulator().load(SANDPILE)
 
 
+@pytest.mark.parametrize(("particles", "capacity"), [(1, 16), (17, 32), (16384, 16384), (16385, 18432), (20000, 20480), (1000000, 1048576)])
+def test_room_for_particles(particles, capacity):
+    assert solver_module._capacity(particles) == capacity
+
+
 def test_two_materials_in_3d_allocate_what_the_plan_says(built):
     simulator = MPMSimulator()
     promised = simulator.plan(POND)
-    kernels = solver_module._Kernels(simulator._structure(POND), solver_module._power_of_two(promised["particles"]), (19, 19, 19), True)
+    kernels = solver_module._Kernels(simulator._structure(POND), solver_module._capacity(promised["particles"]), (19, 19, 19), True)
     assert sorted(each for each in built["fields"] if each[1] > 8) == sorted(map(tuple, promised["fields"].values()))
     assert len(kernels.state) == len(kernels.saved) == 5 + 1 + 2, "x, v, three columns of C; J; b and volume gain"
