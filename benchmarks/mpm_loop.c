@@ -6,7 +6,7 @@
  *
  * Units: positions in cells counted from the ghost corner (walls at node WALL and WALL + cells); everything else as the caller
  * has it. Arrays are per particle: x, v [n][2], C [n][2][2] row-major with C[a][b] = dv_a/dx_b, J [n], b [n][3] (xx, yy, xy),
- * gain [n]. rows, columns: cells along the two axes. Build: cc -O3 -march=native -ffast-math (the Taichi side has fast_math on).
+ * gain [n]. Build: cc -O3 -march=native -ffast-math (the Taichi side has fast_math on).
  */
 #include <math.h>
 #include <stdlib.h>
@@ -17,7 +17,7 @@ enum { WALL = 1, GHOSTS = 2 * WALL + 1 };
 typedef struct { float p[2], m; } Node; /* momentum, then velocity; mass */
 
 typedef struct {
-    int rows, columns; /* cells along x and y */
+    int cells[2];
     float dx, gravity[2], friction;
     float mass, volume; /* of a particle at rest */
 } Setting;
@@ -25,7 +25,7 @@ typedef struct {
 typedef struct { Node *node; int pitch, rows; } Grid;
 
 static Grid make_grid(const Setting *s) {
-    Grid grid = {NULL, s->columns + GHOSTS, s->rows + GHOSTS};
+    Grid grid = {NULL, s->cells[1] + GHOSTS, s->cells[0] + GHOSTS};
     grid.node = malloc(sizeof(Node) * grid.pitch * grid.rows);
     return grid;
 }
@@ -55,7 +55,7 @@ static inline void scatter(Grid grid, const float *x, const float *v, const floa
 
 /* Walls stop what moves into them and take Coulomb friction from the tangential part. */
 static inline void contact(float v[2], int i, int j, const Setting *s) {
-    int at[2] = {i, j}, high[2] = {WALL + s->rows, WALL + s->columns};
+    int at[2] = {i, j}, high[2] = {WALL + s->cells[0], WALL + s->cells[1]};
     for (int a = 0; a < 2; a++) {
         float normal = v[a];
         if ((at[a] == WALL && normal < 0.0f) || (at[a] == high[a] && normal > 0.0f)) {
@@ -89,11 +89,11 @@ static void fold_ghosts(Grid grid, const Setting *s, float dt) {
     int last = grid.rows - 1, end = grid.pitch - 1;
     for (int j = 0; j <= end; j++) {
         fold(grid.node + j, grid.pitch, WALL, j, s, dt);
-        fold(grid.node + last * grid.pitch + j, -grid.pitch, WALL + s->rows, j, s, dt);
+        fold(grid.node + last * grid.pitch + j, -grid.pitch, WALL + s->cells[0], j, s, dt);
     }
     for (int i = 0; i <= last; i++) {
         fold(grid.node + i * grid.pitch, 1, i, WALL, s, dt);
-        fold(grid.node + i * grid.pitch + end, -1, i, WALL + s->columns, s, dt);
+        fold(grid.node + i * grid.pitch + end, -1, i, WALL + s->cells[1], s, dt);
     }
 }
 
@@ -133,7 +133,7 @@ static void fill_ghosts(Grid grid) {
 /* G2P: v = sum w v_i, C = 4 / dx^2 sum w v_i (x_i - x_p)^T, x += dt v, held a hair inside the walls. */
 static inline void gather(Grid grid, const Setting *s, float dt, float *x, float *v, float *C) {
     const float hair = 1e-4f;
-    int bx = (int)(x[0] - 0.5f), by = (int)(x[1] - 0.5f), cells[2] = {s->rows, s->columns};
+    int bx = (int)(x[0] - 0.5f), by = (int)(x[1] - 0.5f), cells[2] = {s->cells[0], s->cells[1]};
     float fx = x[0] - bx, fy = x[1] - by, wx[3], wy[3];
     weights(fx, wx);
     weights(fy, wy);

@@ -24,6 +24,7 @@ One test trajectory of each domain of Sanchez-Gonzalez et al. (2020) that our so
 def caption(path: Path, trajectory: Trajectory) -> str:
     """The first line of a scene file's head, the numbers of the trajectory, its status if it failed."""
     said = path.read_text(encoding="utf-8").splitlines()[0].lstrip("# ").split(": ", 1)[-1]
+    said = said[:1].upper() + said[1:]
     frames, particles, dim = trajectory.position.shape
     fixed = int((~trajectory.moving).sum())
     counted = f"{particles - fixed} particles" + (f" and {fixed} of the boundary" if fixed else "")

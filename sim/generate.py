@@ -163,7 +163,11 @@ def generate(
         except OSError as error:
             raise InputError(out, "out", str(out), f"cannot be written ({os.strerror(error.errno or 0)}); give another folder") from None
         with _lock(out / split, wait_for_it=False):
-            content = _make_split(out, settings, split, wanted, jobs, teacher)
+            try:
+                content = _make_split(out, settings, split, wanted, jobs, teacher)
+            except OSError as error:
+                why = os.strerror(error.errno) if error.errno else str(error)
+                raise RunError(f"{out}: {why}; finished shards are kept, run the same command again to continue") from None
     return content
 
 

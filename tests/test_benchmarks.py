@@ -20,12 +20,12 @@ def _load_benchmark():
 benchmark = _load_benchmark()
 
 
-@pytest.mark.parametrize("material, friction", [("water", 0.0), ("sand", 0.45)])
-def test_c_loop_agrees_with_the_solver(tmp_path, material, friction):
+@pytest.mark.parametrize("material, dim, friction", [("water", 2, 0.0), ("sand", 2, 0.45), ("water", 3, 0.3)])
+def test_c_loop_agrees_with_the_solver(tmp_path, material, dim, friction):
     library = benchmark.build(tmp_path)
     if library is None:
         pytest.skip("no C compiler on PATH")
-    scene = benchmark.block(material, 2, 20, 32, friction)
+    scene = benchmark.block(material, dim, 20, 32, friction)
     simulator, yardstick = MPMSimulator(), benchmark.CLoop(library, scene)
     simulator.load(scene)
     for _ in range(20):

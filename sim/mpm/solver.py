@@ -42,8 +42,8 @@ MAX_HALVINGS = 6
 #: Distance from a wall, in cells, at which particles are stopped.
 HAIR = 1e-4
 #: What a frame adds up: kinetic, potential, elastic energy; the largest of squared speed, wave speed, squared speed within the frame;
-#: particles that are not finite.
-SUMS = 7
+#: particles that are not finite; particles that began it off the grid.
+SUMS = 8
 #: Friction coefficient that stands for ``sticky`` in the obstacles' field.
 STICKY = -1.0
 
@@ -64,6 +64,12 @@ class Structure:
 
 def _power_of_two(n: int) -> int:
     return 1 << max(int(n) - 1, 15).bit_length()
+
+
+def _capacity(particles: int) -> int:
+    """Particles that fields are made for: few different numbers, for each compiles anew, yet of many particles no more than an eighth in vain."""
+    step = _power_of_two(particles) >> (4 if particles > 1 << 14 else 0)
+    return -(-max(particles, 1) // step) * step
 
 
 @ti.data_oriented
@@ -291,7 +297,9 @@ class _Kernels:
             inside = ti.min(ti.max(moved, ti.cast(self.extent[0][d], ti.f32) + HAIR), ti.cast(self.extent[1][d], ti.f32) - HAIR)
             if inside != moved:
                 v[d] = 0.0
-            x[d] = inside
+            # What is not a number passes any comparison, and would be a node's index in the next substep.
+            if finite(moved):
+                x[d] = inside
         self.x[p], self.v[p] = x, v
         if ti.static(self.structure.obstacles != "none"):
             self.push_out(p)
@@ -428,9 +436,9 @@ class _Kernels:
             self.shake(sums)
         ti.loop_config(serialize=True)
         for p in range(keep * self.range[ti.static(len(self.models))]):
-            self.save_particle(p)
+            self.save_particle(p, sums)
         ti.loop_config(serialize=True)
-        for _ in range(substeps):
+        for _ in range(ti.select(sums[7] > 0.0, 0, substeps)):
             low, high = self.spread(dt)
             sums[5] = ti.max(sums[5], ti.cast(self.collect(low, high, dt), ti.f64))
         for m in ti.static(range(len(self.models))):
@@ -441,9 +449,9 @@ class _Kernels:
     def frame_rigid(self, substeps, dt, keep, position, sums) -> None:
         """The same with rigid bodies, in five kernels a substep: all in one took 18 s to compile."""
         if keep:
-            self.save()
+            self.save(sums)
             self.keep_rigid(False)
-        for _ in range(substeps):
+        for _ in range(0 if sums[7] else substeps):
             self.spread_serial(dt, sums)
             self.step_rigid(dt, sums)
             self.collect_serial(dt, sums)
@@ -490,10 +498,10 @@ class _Kernels:
     def frame_parallel(self, substeps, dt, keep, position, sums) -> None:
         """The same, two kernels a substep (five with rigid bodies), all loops parallel (for a GPU)."""
         if keep:
-            self.save()
+            self.save(sums)
             if self.has_rigid:
                 self.keep_rigid(False)
-        for _ in range(substeps):
+        for _ in range(0 if sums[7] else substeps):
             self.spread_parallel(dt, sums)
             if self.has_rigid:
                 self.step_rigid(dt, sums)
@@ -587,14 +595,20 @@ class _Kernels:
                 self.solids[I][lane] = values[row, lane]
 
     @ti.func
-    def save_particle(self, p):
+    def save_particle(self, p, sums: ti.template()):
+        """Count it too if its nodes are not the grid's."""
         for f in ti.static(range(len(self.state))):
             self.saved[f][p] = self.state[f][p]
+        astray = False
+        for d in ti.static(range(self.dim)):
+            x = self.x[p][d]
+            astray = astray or not finite(x) or x < 0.5 or x >= float(ti.static(self.nodes[d])) - 1.5
+        sums[7] += ti.cast(astray, ti.f64)
 
     @ti.kernel
-    def save(self):
+    def save(self, sums: ti.types.ndarray(ti.f64, 1)):
         for p in range(self.range[ti.static(len(self.models))]):
-            self.save_particle(p)
+            self.save_particle(p, sums)
 
     @ti.kernel
     def restore(self):
@@ -649,7 +663,7 @@ class MPMSimulator:
         serial = arch == "cpu" if self.serial is None else self.serial
         particles = scene.particles(self._refine(scene))
         structure, nodes = self._structure(scene), tuple(int(c) + 2 * WALL + 1 for c in self._cells(scene))
-        capacity = _power_of_two(len(particles.position))
+        capacity = _capacity(len(particles.position))
         old, fresh = self._kernels, False
         if old is None or old.structure != structure or old.nodes != nodes or old.capacity < capacity:
             self._kernels, fresh = _Kernels(structure, capacity, nodes, serial), True
@@ -794,7 +808,7 @@ class MPMSimulator:
         particles, cells = scene.particles(self._refine(scene)), self._cells(scene)
         lower, upper = np.array(scene.bounds).T
         dx = self._spacing(scene)
-        n, nodes = _power_of_two(len(particles.position)), int(np.prod(cells + 2 * WALL + 1))
+        n, nodes = _capacity(len(particles.position)), int(np.prod(cells + 2 * WALL + 1))
         particle_fields = {"x": dim, "v": 4, **{f"C{axis}": 4 for axis in range(dim)}}
         left_out = {"third dimension": "a 2D scene"} if dim == 2 else {}
         for name, material in scene.materials.items():
@@ -875,15 +889,28 @@ class MPMSimulator:
         for attempt in range(1 if fixed else MAX_HALVINGS + 1):
             dt = scene.frame_step / substeps
             sums = self._run(substeps, dt, keep=attempt == 0)
+            if sums[7] > 0:
+                raise SimulationError(self._sick() or "a particle is off the grid")
             if self._acceptable(sums, dt):
                 self._frame += 1
                 return np.concatenate([self._position[self._tracked], self._boundary])
-            if attempt < MAX_HALVINGS:
-                self._restore()
-                substeps *= 2
-        if fixed:
-            raise SimulationError(f"the fixed time step {dt:.3g} s gave no finite, stable frame")
-        raise SimulationError(f"time step fell below {dt:.3g} s without a finite, stable frame")
+            self._restore()
+            substeps *= 2
+        why = f"the fixed time step {dt:.3g} s gave no" if fixed else f"time step fell below {dt:.3g} s without a"
+        raise SimulationError(self._sick() or f"{why} finite, stable frame")
+
+    def _sick(self) -> str | None:
+        """What of the state no frame can begin with: the first that is not finite, or particles off the grid. None if it is sound."""
+        state = {name: values.reshape(len(values), -1) for name, values in self.state().items()}
+        wrong = {name: np.flatnonzero(~np.isfinite(values).all(1)) for name, values in state.items()}
+        for name, particles in wrong.items():
+            if len(particles):
+                return f"{name} of particle {particles[0]} is not finite" + (f", nor of {len(particles) - 1} others" if len(particles) > 1 else "")
+        lower, upper = np.array(self._scene.bounds).T
+        away = np.flatnonzero(((state["position"] < lower - self.dx / 2) | (state["position"] > upper + self.dx / 2)).any(1))
+        if len(away):
+            return f"particle {away[0]} is off the grid, at {state['position'][away[0]].round(3).tolist()}"
+        return None
 
     def _acceptable(self, sums: np.ndarray, dt: float) -> bool:
         """Whether a frame's ``SUMS`` are finite and, unless nothing guards the step, within the limits that it was planned for."""

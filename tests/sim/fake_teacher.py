@@ -1,4 +1,4 @@
-"""Teachers that cost nothing, in a module of their own because worker processes import them by name."""
+"""Teachers that cost nothing or go wrong, in a module of their own because worker processes import them by name."""
 
 import os
 import resource
@@ -74,3 +74,38 @@ class FullDisk(FakeTeacher):
 class Broken(FakeTeacher):
     def load(self, scene):
         raise KeyError("a fault of ours\nin two lines")
+
+
+#: What ``poisoned`` does to which trajectories of a training split: field of the solver's kernels, content of one of its particles.
+POISONS = {
+    1: ("velocity", np.nan), 2: ("velocity", -np.inf), 3: ("strain", np.nan), 5: ("position", np.nan), 6: ("position", -7.0), 7: ("position", 1e9),
+}
+#: The frame before which it happens, and the particle of the field.
+POISON_FRAME, POISON_PARTICLE = 4, 17
+
+
+def poisoned():
+    """The real solver, which some bit flip spoils in the middle of the trajectories of ``POISONS``; the strain (b - I) is the sand's."""
+    from sim.generate import trajectory_seed
+    from sim.mpm.solver import MPMSimulator
+
+    poisons = {trajectory_seed(0, "train", index): poison for index, poison in POISONS.items()}
+
+    class Poisoned(MPMSimulator):
+        def load(self, scene):
+            super().load(scene)
+            self.poison, self.count = poisons.get(scene.seed), 0
+
+        def frame(self):
+            self.count += 1
+            if self.count == POISON_FRAME and self.poison:
+                kernels, (field, value) = self._kernels, self.poison
+                sand = [name for name, *_ in kernels.models].index("sand")
+                at = kernels.range[sand] if field == "strain" else 0
+                field = {"velocity": kernels.v, "position": kernels.x, "strain": kernels.materials[sand].b}[field]
+                content = field.to_numpy()
+                content[at + POISON_PARTICLE, 0] = value
+                field.from_numpy(content)
+            return super().frame()
+
+    return Poisoned()

@@ -15,39 +15,12 @@ HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE))  # worker processes inherit it
 
 from fake_teacher import AlwaysFailing, Broken, FakeTeacher, FullDisk, SometimesFailing, Suicidal  # noqa: E402
+from tiny import FAMILY, family, hidden, shards, without_cost  # noqa: E402
 
 import sim.generate  # noqa: E402
 from sim.errors import InputError, RunError  # noqa: E402
 from sim.generate import generate, simulate, training_statistics, trajectory_seed  # noqa: E402
-from sim.scene import SceneFamily  # noqa: E402
 from sim.trajectory import ShardReader, write_shard  # noqa: E402
-
-FAMILY = {
-    "name": "tiny", "dim": 2, "bounds": [[0.0, 1.0], [0.0, 1.0]], "gravity": [0.0, -9.8], "frame_step": 0.01, "frames": 12, "radius": 0.1,
-    "cells": [16, 16], "materials": {"water": {"model": "water", "sound_speed": 5.0}},
-    "bodies": [{"material": "water", "shape": {"kind": "box", "size": [[0.2, 0.4], [0.2, 0.4]]}, "velocity": [[-1, 1], [-1, 1]]}],
-    "splits": {"train": 6, "valid": 2, "test": 2},
-}
-
-
-def family(**changes):
-    return SceneFamily(FAMILY | changes, "tiny.yaml")
-
-
-def shards(folder):
-    """Bytes of every shard by name."""
-    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.glob("*/*.h5"))}
-
-
-def without_cost(folder):
-    content = json.loads((folder / "dataset.json").read_text())
-    for split in content["splits"].values():
-        del split["cost"]
-    return content
-
-
-def hidden(folder):
-    return [path for path in folder.rglob(".*")]
 
 
 def run_here(out, shards, jobs, teacher, progress):

@@ -474,7 +474,9 @@ def test_not_a_number_is_caught_within_its_frame(request, field, material, value
             return solver.frame()
 
     trajectory = simulate(Poisoned(), what)
-    assert trajectory.status.startswith("failed: time step fell below") and trajectory.status.endswith("(frame 4)")
+    known = {"velocity": "velocity", "gradient": "velocity gradient", "material": {"water": "water.J", "sand": "sand.b - I"}[material]}[field]
+    why = "time step fell below" if np.isfinite(value) else f"{known} of particle 17 is not finite (frame 4)"
+    assert trajectory.status.startswith(f"failed: {why}") and trajectory.status.endswith("(frame 4)")
     assert len(trajectory.position) == 4 and np.isfinite(trajectory.position).all(), "the frames before it are kept"
 
 
@@ -634,9 +636,14 @@ def test_water_compiles_no_decomposition(monkeypatch):
         MPMSimulator().load(SANDPILE)
 
 
+@pytest.mark.parametrize(("particles", "capacity"), [(1, 16), (17, 32), (16384, 16384), (16385, 18432), (20000, 20480), (1000000, 1048576)])
+def test_room_for_particles(particles, capacity):
+    assert solver_module._capacity(particles) == capacity
+
+
 def test_two_materials_in_3d_allocate_what_the_plan_says(built):
     simulator = MPMSimulator()
     promised = simulator.plan(POND)
-    kernels = solver_module._Kernels(simulator._structure(POND), solver_module._power_of_two(promised["particles"]), (19, 19, 19), True)
+    kernels = solver_module._Kernels(simulator._structure(POND), solver_module._capacity(promised["particles"]), (19, 19, 19), True)
     assert sorted(each for each in built["fields"] if each[1] > 8) == sorted(map(tuple, promised["fields"].values()))
     assert len(kernels.state) == len(kernels.saved) == 5 + 1 + 2, "x, v, three columns of C; J; b and volume gain"

@@ -261,5 +261,5 @@ def test_rigid_bodies_are_built_only_where_they_are(built):
     assert "rigid bodies" in wet["left_out"] and not any("rigid" in name or "contact" in name for name in wet["fields"])
     simulator = MPMSimulator()
     promised = simulator.plan(FLOAT)
-    solver_module._Kernels(simulator._structure(FLOAT), solver_module._power_of_two(promised["particles"]), (19, 19), True)
+    solver_module._Kernels(simulator._structure(FLOAT), solver_module._capacity(promised["particles"]), (19, 19), True)
     assert sorted(each for each in built["fields"] if each[1] > 8) == sorted(map(tuple, promised["fields"].values()))
