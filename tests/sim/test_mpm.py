@@ -530,6 +530,18 @@ def test_only_materials_that_ring_bound_the_step_of_a_lone_particle():
     assert courant(WATER) < 0.9 / np.sqrt(2) * 1.001
 
 
+def test_a_volume_turned_inside_out_twice_is_not_sound():
+    """A step of 1 + tr G = -4 and another: J = 16 looked like a torn drop, and the frame was accepted."""
+    drops = Experiments(WaterModel, 2, 2, True, False)
+    drops.set(Water(model="water", sound_speed=10.0))
+    drops.reset()
+    once = np.array([np.diag([-5.0, 0.0]), np.diag([-0.5, 0.0])])
+    drops.strain(once)
+    assert drops.intact.tolist() == [0, 1]
+    drops.strain(once)
+    assert drops.intact.tolist() == [0, 1] and drops.model.J.to_numpy()[1] == pytest.approx(0.25)
+
+
 def test_a_step_that_would_need_too_many_halvings_is_given_up(water, monkeypatch):
     run(water, DROP, 3)
     tried = []

@@ -80,7 +80,8 @@ class WaterModel:
     @ti.func
     def kirchhoff(self, p, gradient_dt, dt):
         growth = gradient_dt.trace()
-        J = self.J[p] * (1.0 + growth)
+        # A volume that was once turned inside out stays zero and so is not intact: turned twice within a frame, it would look sound.
+        J = self.J[p] * ti.max(1.0 + growth, 0.0)
         self.J[p] = J
         tau = ti.Matrix.identity(ti.f32, self.dim) * (-self.parameters[0] * (self.power(J) - J))
         if ti.static(self.viscous):
