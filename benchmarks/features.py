@@ -3,13 +3,11 @@
     python benchmarks/features.py [--quick]
 
 Each row is a pair of scenes of the same block of particles that differ in one feature. Both advance in turn in one process on one
-thread; cost is CPU time a particle and substep, the ratio is the median of the rounds' ratios. First calls (CPU seconds of ``load`` and a
-frame, kernels compiled) and bytes (``plan``) are beside it. Rows are printed and saved as ``benchmarks/results/features.json``.
+thread; cost is CPU time a particle and substep, the ratio is the median of the rounds' ratios. The bytes of ``plan`` are beside it. Rows are
+printed and saved as ``benchmarks/results/features.json``.
 """
 
 import argparse
-import os
-import tempfile
 from functools import partial
 
 import numpy as np
@@ -70,9 +68,10 @@ def measure(feature: str, rounds: int, target: float) -> dict:
     from sim.mpm.solver import MPMSimulator
 
     scenes = [Scene.from_dict(content) for content in PAIRS[feature]]
-    solvers, first, frames = [MPMSimulator(), MPMSimulator()], [], []
+    solvers, frames = [MPMSimulator(), MPMSimulator()], []
     for solver, each in zip(solvers, scenes, strict=True):
-        first.append(timed(partial(_begin, solver, each))[0])
+        solver.load(each)
+        solver.frame()
         frames.append(max(1, int(np.ceil(target / max(timed(solver.frame)[0], 1e-4)))))
     counts = [len(each.particles().position) for each in scenes]
     costs = []
@@ -83,13 +82,8 @@ def measure(feature: str, rounds: int, target: float) -> dict:
     sizes = [solver.plan(each)["bytes"] / count for solver, each, count in zip(solvers, scenes, counts, strict=True)]
     row = {"feature": feature, "ratio": float(np.median(costs[:, 1] / costs[:, 0]))}
     for side, name in enumerate(("without", "with")):
-        row |= {f"{name}_ns": float(np.median(costs[:, side])), f"{name}_first_call_seconds": first[side], f"{name}_bytes_a_particle": sizes[side]}
+        row |= {f"{name}_ns": float(np.median(costs[:, side])), f"{name}_bytes_a_particle": sizes[side]}
     return row
-
-
-def _begin(solver, scene: Scene) -> None:
-    solver.load(scene)
-    solver.frame()
 
 
 def main() -> None:
@@ -98,15 +92,12 @@ def main() -> None:
     quick = parser.parse_args().quick
     rounds, target = (5, 0.1) if quick else (9, 0.5)
     rows = []
-    with tempfile.TemporaryDirectory() as folder:
-        # An empty kernel cache, so that the first calls show what compiling costs.
-        os.environ["SLUICE_TAICHI_CACHE"] = f"{folder}/kernels"
-        print(f"{'feature':28}{'ns a particle-substep':>24}{'ratio':>7}{'first call, CPU s':>20}{'bytes a particle, grid included':>34}")
-        for feature in PAIRS:
-            row = measure(feature, rounds, target)
-            rows.append(row)
-            print("{feature:28}{without_ns:12.1f} -> {with_ns:8.1f}{ratio:7.2f}{without_first_call_seconds:10.1f} -> {with_first_call_seconds:6.1f}"
-                  "{without_bytes_a_particle:20.0f} -> {with_bytes_a_particle:10.0f}".format(**row), flush=True)  # fmt: skip
+    print(f"{'feature':28}{'ns a particle-substep':>24}{'ratio':>7}{'bytes a particle, grid included':>34}")
+    for feature in PAIRS:
+        row = measure(feature, rounds, target)
+        rows.append(row)
+        print("{feature:28}{without_ns:12.1f} -> {with_ns:8.1f}{ratio:7.2f}{without_bytes_a_particle:20.0f} -> {with_bytes_a_particle:10.0f}"
+              .format(**row), flush=True)  # fmt: skip
     save("features", rows, rounds)
 
 

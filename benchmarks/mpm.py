@@ -35,7 +35,7 @@ ROOT = Path(__file__).resolve().parent
 FLAGS = ("-O3", "-march=native", "-ffast-math")
 MATERIALS = {
     "water": {"model": "water", "density": 1000.0, "sound_speed": 30.0, "gamma": 7.0},
-    "sand": {"model": "sand", "density": 1800.0, "young_modulus": 3.5e5, "poisson_ratio": 0.3, "friction_angle": 37.0},
+    "sand": {"model": "sand", "density": 1800.0, "young_modulus": 3.5e5, "poisson_ratio": 0.3, "friction_angle": 36.0},
 }
 #: (particles along an edge of the block, cells along an edge of the box): about 1k, 5k and 20k particles.
 SIZES_2D = ((32, 64), (71, 128), (141, 256))

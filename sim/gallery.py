@@ -7,6 +7,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from PIL import Image
+
 from sim.errors import InputError
 from sim.generate import mpm_teacher, simulate, trajectory_seed
 from sim.paper import DOMAINS
@@ -16,9 +18,12 @@ from sim.trajectory import Trajectory, atomic_path
 
 HEAD = """# Gallery
 
-One test trajectory of each domain of Sanchez-Gonzalez et al. (2020) that our solvers make so far, six moments from start to end. Made by
-`make gallery`; the scenes are in `configs/scenes/`. Colour is speed, or the kind of matter where several meet.
+One test trajectory of each domain of Sanchez-Gonzalez et al. (2020) that our solvers make so far, and of our FLUIDSHAKE with a floating box,
+six moments from start to end. Made by `make gallery`; the scenes are in `configs/scenes/`, and [domains.md](domains.md) sets their numbers
+beside the published ones. Colour is speed, or the kind of matter where several meet.
 """
+#: Shown beside the paper's.
+OURS = ("fluidshake_box",)
 
 
 def caption(path: Path, trajectory: Trajectory) -> str:
@@ -31,6 +36,12 @@ def caption(path: Path, trajectory: Trajectory) -> str:
     return f"{said} {counted}, {frames - 1} steps of {trajectory.frame_step:g} s, {dim}D." + ("" if trajectory.ok else f" **{trajectory.status}**")
 
 
+def shrink(path: Path) -> None:
+    """To a palette of 256 colours, a third of the bytes: strips are kept with the documents."""
+    with Image.open(path) as picture, atomic_path(path) as temporary:
+        picture.convert("RGB").quantize(256).save(temporary, optimize=True)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Make the gallery; see the module."""
     parser = argparse.ArgumentParser(prog="python -m sim.gallery", description="A film strip of every domain.")
@@ -38,7 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, default=Path("docs"), help="folder of gallery.md and gallery/*.png (default docs)")
     parser.add_argument("--width", type=int, default=180, help="pixels of a moment (default 180)")
     options = parser.parse_args(arguments)
-    paths = [path for name in DOMAINS if (path := options.scenes / f"{name}.yaml").exists()]
+    paths = [path for name in (*DOMAINS, *OURS) if (path := options.scenes / f"{name}.yaml").exists()]
     if not paths:
         print(InputError("sluice gallery", "scenes", str(options.scenes), "holds no scene of a domain"), file=sys.stderr)
         return 2
@@ -46,7 +57,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for path in sorted(paths):
         trajectory = simulate(teacher, SceneFamily.load(path).sample(trajectory_seed(0, "test", 0), "test"))
         name = path.stem
-        render_strip(options.out / "gallery" / f"{name}.png", trajectory, width=options.width)
+        picture = options.out / "gallery" / f"{name}.png"
+        render_strip(picture, trajectory, width=options.width)
+        shrink(picture)
         sections.append(f"## {name.upper().replace('_', '-')}\n{caption(path, trajectory)}\n\n![{name}: six moments](gallery/{name}.png)")
         print(f"{name}: {trajectory.status}", flush=True)
     with atomic_path(options.out / "gallery.md") as temporary:

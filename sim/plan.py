@@ -10,12 +10,13 @@ from sim.errors import InputError
 from sim.generate import SPLITS, trajectory_seed
 from sim.scene import SceneFamily
 
-#: Particle-substeps per second of one core, by dimension and the slowest material present: the order of a 2-core cloud machine of
-#: 2023. ``make bench`` measures this machine's water and sand; goop, elastic and snow in 2D were measured against them (0.9, 1.25 and 0.7
-#: times sand), elastic in 3D by itself; goop and snow in 3D are guesses from sand, whose decomposition they share.
+#: Particle-substeps per second of one core, by dimension and the slowest material present, on a quiet AMD EPYC with AVX2: water and sand
+#: as ``make bench`` measures them (2D: 24-30 and 11.5-13 million for 1k to 20k particles; 3D: 15 and 2.7); goop, elastic and snow in 2D were
+#: measured against sand (0.9, 1.25 and 0.7 times), elastic in 3D against water; goop and snow in 3D are guesses from sand, whose
+#: decomposition they share. ``benchmarks/paper_data.py`` sets the estimates beside samples.
 RATES = {
-    (2, "water"): 12e6, (2, "sand"): 6e6, (2, "goop"): 5.5e6, (2, "elastic"): 7.5e6, (2, "snow"): 4e6, (2, "rigid"): 12e6,
-    (3, "water"): 4e6, (3, "sand"): 1.5e6, (3, "goop"): 1.5e6, (3, "elastic"): 2.5e6, (3, "snow"): 1.5e6, (3, "rigid"): 4e6,
+    (2, "water"): 26e6, (2, "sand"): 12e6, (2, "goop"): 11e6, (2, "elastic"): 15e6, (2, "snow"): 8.5e6, (2, "rigid"): 26e6,
+    (3, "water"): 15e6, (3, "sand"): 2.7e6, (3, "goop"): 2.7e6, (3, "elastic"): 9e6, (3, "snow"): 2.7e6, (3, "rigid"): 15e6,
 }
 
 #: Scenes drawn to describe a family.
