@@ -45,7 +45,7 @@ def test_the_page_says_what_failed(tmp_path):
         "rotation": [*outcomes("rotation", 0, 0, 0)[:2], "time step fell below 1e-9 s"],
     }
     text, holds = page(found, tmp_path, "versions")
-    assert not holds and "1 of 3 cases hold. Missed: Dam break, Rotation." in text
+    assert not holds and "1 of 3 cases hold. Missed: Dam break, Rotation and free fall." in text
     assert "failed: time step fell below" in text and "label -0.11" in text
     assert sorted(path.stem for path in (tmp_path / "validation").iterdir()) == sorted(found)
     text, holds = page({"hydrostatics": found["hydrostatics"]}, tmp_path, "versions")
