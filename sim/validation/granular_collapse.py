@@ -54,10 +54,17 @@ def power_law(name: str, what: str, aspects: np.ndarray, ours: np.ndarray, power
 def run(resolution: int) -> Outcome:
     """Run-outs and heights over a, run-out and slope over the friction angle.
 
-    As long as a plateau stands, a column knows no length but H0, so that its run-out is a multiple of it; resolved along L0, as tall ones
-    are, low columns are a few cells high, and a thin layer is held by the floor's nodes. What else keeps sand from running out is what
-    the transfers dissipate, as a viscosity of about dx^2 / dt would: less with fewer, larger steps, so with softer sand. Hence E, too, is in
-    units of rho g H0.
+    As long as a plateau stands, a column knows no length but H0, and its run-out is a multiple of it: low columns are resolved along H0, so that
+    those of 1.5 and 2, without a plateau, are what is compared. Resolved along L0, as tall ones are, they would be a few cells high, and thin
+    layers are held by the floor's nodes.
+
+    What keeps the sand short of its run-out is what the transfers dissipate in every substep, as a viscosity of about dx^2 / dt = dx c would. At
+    a = 1 and E = 300 rho g H0, 24 cells high, run-outs of 99 % of the sand were 1.17, 1.30 and 1.36 L0 for Courant numbers 0.25, 0.5 and 0.9;
+    0.89 and 1.16 L0 with 12 and 24 cells at E = 1000, 1.33 with 24 at E = 100. So E, too, is in units of rho g H0, and low.
+
+    Of tall columns the law is not what a continuum of constant friction is known to do: without collisions to dissipate the fall it runs out in
+    proportion to a for longer than grains do (Kumar 2015, ch. 4: MPM and discrete elements side by side), as it does here. Finer grids bring
+    the exponent down.
     """
     solver = MPMSimulator()
     low, tall = ([collapse(solver, resolution, a, PHI) for a in aspects] for aspects in (LOW, TALL))
