@@ -11,7 +11,7 @@ from sim.validation.ladder import main, module, order, page
 #: Cases that hold, each at the least resolution that is worth its time. Those that do not hold yet are in docs/validation.md.
 AFFORDABLE = {
     "rotation": 32, "return_map": 1000, "hydrostatics": 32, "elastic_column": 16, "axial_bar": 4, "cantilever": 4, "standing_wave": 32,
-    "dam_break": 16, "block_on_plane": 32, "elastic_discs": 40,
+    "dam_break": 16, "block_on_plane": 32, "elastic_discs": 40, "viscoplastic_slump": 80,
 }
 
 
