@@ -62,7 +62,8 @@ def figure(title: str, outcomes: list[Outcome], path: Path) -> None:
     for (left, right), name in zip(panels, names, strict=True):
         curves = [outcome.curves[name] for outcome in outcomes]
         for outcome, curve, shade in zip(outcomes, curves, np.linspace(0.3, 1, len(curves)), strict=True):
-            left.plot(curve.x, curve.ours, ".-", ms=3, lw=1, color="C0", alpha=shade, label=f"resolution {outcome.resolution}")
+            marked = ".-" if len(curve.x) < 300 else "-"
+            left.plot(curve.x, curve.ours, marked, ms=3, lw=1, color="C0", alpha=shade, label=f"resolution {outcome.resolution}")
         left.plot(curves[-1].x, curves[-1].reference, "k--", lw=1.2, label="reference")
         left.set(xlabel=curves[-1].axes[0], ylabel=curves[-1].axes[1], title=name)
         left.legend(fontsize=7)
