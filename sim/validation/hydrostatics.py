@@ -36,6 +36,7 @@ def run(resolution: int) -> Outcome:
         "pressure": Curve("relative L2 error of the pressure", ("height / H", "p / rho g H"), y / H, exact / unit, p / unit, l2(p, exact), 0.03),
         "surface": Curve("loss of the surface's height, relative", ("height / H at the start", "height / H"), np.array([0.0, 1.0]),
                          np.array([0.0, 1.0]), np.array([0.0, 1.0 - loss]), loss, 0.02),
-        "rest": Curve("kinetic energy / rho g H V", ("", ""), np.array([0.0, 1.0]), np.zeros(2), np.full(2, still), still, 1e-3),
+        "rest": Curve("kinetic energy / rho g H V", ("", "kinetic energy / rho g H V"), np.array([0.0, 1.0]), np.zeros(2),
+                      np.full(2, still), still, 1e-3),
     }  # fmt: skip
     return Outcome("hydrostatics", resolution, len(row), curves, seconds)

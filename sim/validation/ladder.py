@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import inspect
+import textwrap
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
@@ -44,17 +46,24 @@ def order(resolutions: Sequence[int], errors: Sequence[float]) -> float:
     return float(-np.polyfit(np.log(resolutions), np.log(np.maximum(np.abs(errors), 1e-12)), 1)[0])
 
 
+def _decades(values: Sequence[float]) -> tuple[float, float]:
+    """Whole decades about positive values: a shorter logarithmic axis has its ticks' numbers on top of each other."""
+    low, high = (np.log10(each(values)) for each in (min, max))
+    return 10.0 ** np.floor(low - 0.1), 10.0 ** np.ceil(high + 0.1)
+
+
 def figure(title: str, outcomes: list[Outcome], path: Path) -> None:
     """A row a comparison: the reference and ours at each resolution; error against wall time with the tolerance."""
     from matplotlib.figure import Figure
 
     names = list(outcomes[-1].curves)
-    canvas = Figure(figsize=(9, 2.9 * len(names) + 0.3), layout="constrained")
+    canvas = Figure(figsize=(9, 2.9 * len(names) + 0.5), layout="constrained")
     panels = canvas.subplots(len(names), 2, width_ratios=[1.4, 1], squeeze=False)
     for (left, right), name in zip(panels, names, strict=True):
         curves = [outcome.curves[name] for outcome in outcomes]
         for outcome, curve, shade in zip(outcomes, curves, np.linspace(0.3, 1, len(curves)), strict=True):
-            left.plot(curve.x, curve.ours, ".-", ms=3, lw=1, color="C0", alpha=shade, label=f"resolution {outcome.resolution}")
+            marked = ".-" if len(curve.x) < 300 else "-"
+            left.plot(curve.x, curve.ours, marked, ms=3, lw=1, color="C0", alpha=shade, label=f"resolution {outcome.resolution}")
         left.plot(curves[-1].x, curves[-1].reference, "k--", lw=1.2, label="reference")
         left.set(xlabel=curves[-1].axes[0], ylabel=curves[-1].axes[1], title=name)
         left.legend(fontsize=7)
@@ -63,9 +72,10 @@ def figure(title: str, outcomes: list[Outcome], path: Path) -> None:
         for outcome, *place in zip(outcomes, seconds, errors, strict=True):
             right.annotate(f" {outcome.resolution}", place, fontsize=8)
         right.axhline(curves[-1].tolerance, color="C3", lw=1, label="tolerance")
-        right.set(xlabel="wall time [s], one core", ylabel="error")
+        right.set(xlabel="wall time [s], one core", ylabel="error", xlim=_decades(seconds))
+        right.set_ylim(_decades([*errors, curves[-1].tolerance or errors[-1]]))
         right.legend(fontsize=7)
-    canvas.suptitle(title, fontsize=11)
+    canvas.suptitle("\n".join(textwrap.wrap(title, 100)), fontsize=11)
     with atomic_path(path) as temporary:
         canvas.savefig(temporary, format="svg")
 
@@ -87,7 +97,7 @@ def page(found: dict[str, list[Outcome | str]], folder: Path, versions: str) -> 
             tolerance = "-" if curves[-1] is None else f"{curves[-1].tolerance:g}"
             cells = [str(what.NUMBER), f"[{title.split(':')[0]}](#{case})", name, errors, tolerance, "yes" if passed else "**no**", rate, seconds]
             rows.append("| " + " | ".join(cells) + " |")
-        lines = [f'<a id="{case}"></a>', f"## {what.NUMBER}. {title}", ""]
+        lines = [f'<a id="{case}"></a>', f"## {what.NUMBER}. {title}", "", inspect.getdoc(what.run), ""]
         for resolution, each in zip(what.RESOLUTIONS, results, strict=True):
             said = f"failed: {each}" if isinstance(each, str) else "; ".join(curve.label for curve in each.curves.values())
             lines.append(f"- {resolution}: {said}")
