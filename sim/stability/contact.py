@@ -12,7 +12,6 @@ from sim.validation import scene
 CELLS, G = 16, 9.8
 EXPECTED = "finite, inside the box, no velocity into a wall that is touched, to rounding"
 PIECE = 0.5 / CELLS
-EPS = float(np.finfo(np.float32).eps)
 
 
 def _square(x: float, y: float, side: float, velocity: tuple[float, float]) -> dict:
