@@ -77,7 +77,7 @@ def test_kill_9_at_twenty_instants(tmp_path):
     working = time.monotonic() - begun - first
     expected, content = shards(unbroken), without_cost(unbroken)
     assert process.returncode == 0 and len(expected) == 16 and shards(tmp_path / "warm") == expected
-    rng, stages = np.random.default_rng(20), []
+    rng, stages, chains = np.random.default_rng(20), [], 1
     while len(stages) < 20:
         left = 1 - len(shards(folder)) / 16
         instant = rng.uniform(0, first) if len(stages) % 4 == 0 else first + rng.uniform(0, working) * left
@@ -92,7 +92,8 @@ def test_kill_9_at_twenty_instants(tmp_path):
             assert present.items() <= expected.items(), "what is there is finished, to the last byte"
         else:
             assert shards(folder) == expected and without_cost(folder) == content and not hidden(folder)
-            folder = tmp_path / f"broken-{len(stages)}"
+            chains += 1
+            folder = tmp_path / f"broken-{chains}"
     assert start(folder).wait() == 0
     assert shards(folder) == expected and without_cost(folder) == content and not hidden(folder)
     assert len(set(stages)) >= 4, f"the kills met too few stages to mean much: {stages}"
