@@ -10,7 +10,7 @@ from sim.errors import InputError
 from sim.generate import SPLITS, trajectory_seed
 from sim.scene import SceneFamily
 
-#: Particle-substeps per second of one core, by dimension and the slowest material present, on a quiet AMD EPYC with AVX2. Sand as
+#: Particle-substeps per second of one core, by dimension and the slowest material present, on a quiet AMD EPYC with AVX-512. Sand as
 #: ``make bench`` measures it (2D: 11.5-13 million for 1k to 20k particles; 3D: 2.7), and 3D water (15). 2D water as WATERDROP takes it
 #: (0.29 s a trajectory): a block runs at 24-30 million, but splashes take more substeps than planned, in frames so short that their ends
 #: show. Goop, elastic and snow in 2D were measured against sand (0.9, 1.25 and 0.7 times), elastic in 3D against water; goop and snow in
