@@ -55,6 +55,7 @@ def _decades(values: Sequence[float]) -> tuple[float, float]:
 def figure(title: str, outcomes: list[Outcome], path: Path) -> None:
     """A row a comparison: the reference and ours at each resolution; error against wall time with the tolerance."""
     from matplotlib.figure import Figure
+    from matplotlib.ticker import NullFormatter
 
     names = list(outcomes[-1].curves)
     canvas = Figure(figsize=(9, 2.9 * len(names) + 0.5), layout="constrained")
@@ -67,13 +68,16 @@ def figure(title: str, outcomes: list[Outcome], path: Path) -> None:
         left.plot(curves[-1].x, curves[-1].reference, "k--", lw=1.2, label="reference")
         left.set(xlabel=curves[-1].axes[0], ylabel=curves[-1].axes[1], title=name)
         left.legend(fontsize=7)
-        seconds, errors = [max(outcome.seconds, 1e-3) for outcome in outcomes], [max(abs(curve.error), 1e-9) for curve in curves]
-        right.loglog(seconds, errors, "o-", color="C0")
+        seconds, errors = [max(outcome.seconds, 1e-3) for outcome in outcomes], [abs(curve.error) for curve in curves]
+        right.set(xlabel="wall time [s], one core", ylabel="error", xscale="log", xlim=_decades(seconds))
+        right.xaxis.set_minor_formatter(NullFormatter())
+        right.plot(seconds, errors, "o-", color="C0")
+        if min(errors) > 0:  # zero has no place on a logarithmic axis
+            right.set_yscale("log")
+            right.set_ylim(_decades([*errors, curves[-1].tolerance or errors[-1]]))
         for outcome, *place in zip(outcomes, seconds, errors, strict=True):
             right.annotate(f" {outcome.resolution}", place, fontsize=8)
         right.axhline(curves[-1].tolerance, color="C3", lw=1, label="tolerance")
-        right.set(xlabel="wall time [s], one core", ylabel="error", xlim=_decades(seconds))
-        right.set_ylim(_decades([*errors, curves[-1].tolerance or errors[-1]]))
         right.legend(fontsize=7)
     canvas.suptitle("\n".join(textwrap.wrap(title, 100)), fontsize=11)
     with atomic_path(path) as temporary:
