@@ -5,6 +5,9 @@ import numpy as np
 from sim.mpm.decomposition import assemble, decompose, expm1, finite, log1p, pack, unpack
 from sim.taichi_runtime import ti
 
+#: Smallest eigenvalue of b - I that a principal return map keeps.
+CRUSHED = -0.999999
+
 
 def lame(material, stiffness: float) -> tuple[float, float]:
     """Lame's lambda and mu [Pa]; ``stiffness`` multiplies Young's modulus."""
@@ -112,8 +115,8 @@ class Principal(LeftCauchyGreen):
     """A material whose plastic flow is a map of the principal Hencky strains e_i = log(sigma_i) of b (Simo 1992).
 
     A subclass gives ``return_map(p, e, dt)`` -> (e on or inside the yield surface, whether it moved), which may update the
-    subclass's own state, ``stress(p, e)`` and ``energy(p, e)``. The default is Hencky's law. Singular values below 1e-3 are
-    taken for 1e-3: float32 holds no more of b - I.
+    subclass's own state, ``stress(p, e)`` and ``energy(p, e)``. The default is Hencky's law. Singular values below 1e-3 become
+    1e-3, by crushing that is not given back: float32 holds no more of b - I, and its rounding would turn the volume's sign.
     """
 
     left_out = LeftCauchyGreen.left_out | {"SVD": "replaced by a symmetric decomposition of b"}
@@ -123,7 +126,7 @@ class Principal(LeftCauchyGreen):
         """log(sigma_i) = log(1 + beta_i) / 2 of the eigenvalues beta of b - I."""
         e = values
         for i in ti.static(range(self.dim)):
-            e[i] = 0.5 * log1p(ti.max(values[i], -0.999999))
+            e[i] = 0.5 * log1p(ti.max(values[i], CRUSHED))
         return e
 
     @ti.func
@@ -147,7 +150,7 @@ class Principal(LeftCauchyGreen):
             e, moved = self.return_map(p, self.hencky(values), dt)
             tau = unpack(assemble(self.stress(p, e), frame))
             kept = trial
-            if moved:
+            if moved or values.min() < CRUSHED:
                 kept = assemble(ti.Vector([expm1(2.0 * e[i]) for i in ti.static(range(self.dim))]), frame)
         self.b[p] = kept
         return tau
