@@ -44,8 +44,16 @@ HAIR = 1e-4
 #: What a frame adds up: kinetic, potential, elastic energy; the largest of squared speed, wave speed, squared speed within the frame;
 #: particles that are not finite; particles that began it off the grid.
 SUMS = 8
-#: Friction coefficient that stands for ``sticky`` in the obstacles' field.
+#: Friction coefficient that stands for ``sticky`` in the obstacles' fields.
 STICKY = -1.0
+#: Thickness in cells from which nodes in an obstacle are reached from one of its faces alone.
+THICK = 3.0
+#: Depth in cells of the nodes in an obstacle that a particle may reach: 1.5 along each of three axes.
+REACH = 2.6
+#: Of them, in line behind the one at the surface.
+BEHIND = 3
+#: Sweeps over the obstacles' contacts at most, and the change of an impulse, relative to the largest, at which they end.
+SWEEPS, SETTLED = 12, 1e-3
 
 
 @dataclass(frozen=True)
@@ -83,8 +91,8 @@ class _Kernels:
     Positions are stored in cells, from the padded corner.
     """
 
-    def __init__(self, structure: Structure, capacity: int, nodes: tuple[int, ...], serial: bool):
-        self.structure, self.capacity, self.nodes = structure, capacity, nodes
+    def __init__(self, structure: Structure, capacity: int, nodes: tuple[int, ...], columns: int, serial: bool):
+        self.structure, self.capacity, self.nodes, self.columns_at_most = structure, capacity, nodes, columns
         dim, models = self.dim, self.models = structure.dim, structure.models
         self.friction = structure.friction
         self.x = ti.Vector.field(dim, ti.f32, capacity)
@@ -103,6 +111,10 @@ class _Kernels:
         self.pull = ti.Vector.field(dim, ti.f32, ()) if structure.shaken else self.gravity
         if structure.obstacles != "none":
             self.solids = ti.Vector.field(dim + 2, ti.f32, nodes)  # normal, distance in cells, friction of the nearest obstacle
+            self.columns = ti.field(ti.i32, ())
+            self.foot = ti.Vector.field(2 * dim + 1, ti.i32, columns)  # node, step outwards, nodes behind it
+            self.face = ti.Vector.field(dim + 2, ti.f32, columns)  # normal, friction, weight of the node
+            self.impulse = ti.Vector.field(dim + 2, ti.f32, columns)  # and the momenta that a unit impulse gives to the two nodes
         self.E = ti.Vector.field(4, ti.f32, 3)
         self.state = [self.x, self.v, *self.C, *(field for material in self.materials for field in material.fields())]
         self.saved = [
@@ -160,24 +172,16 @@ class _Kernels:
 
     @ti.func
     def update_node(self, I, dt):
-        """Momentum to velocity, gravity, walls, obstacles."""
+        """Momentum to velocity, gravity, walls."""
         cell = self.grid[I]
         if cell[self.dim] > 0.0:
             inverse = 1.0 / cell[self.dim]
             v = ti.Vector.zero(ti.f32, self.dim)
             for d in ti.static(range(self.dim)):
                 v[d] = cell[d] * inverse + dt * self.pull[None][d]
-            # A name of its own: reassigning v from a function inside a branch is stored with its old value (Taichi 1.7.4).
             u = wall(v, I, self.extent[0], self.extent[1], self.friction, self.coefficient[None])
-            if ti.static(self.structure.obstacles != "none"):
-                w = solid(u, self.solids[I], self.structure.obstacles)
-                # The wall once more: an obstacle that leans on it must not push into it.
-                x = wall(w, I, self.extent[0], self.extent[1], self.friction, self.coefficient[None])
-                for d in ti.static(range(self.dim)):
-                    cell[d] = x[d]
-            else:
-                for d in ti.static(range(self.dim)):
-                    cell[d] = u[d]
+            for d in ti.static(range(self.dim)):
+                cell[d] = u[d]
             cell[self.dim] = 1.0
             self.grid[I] = cell
 
@@ -327,10 +331,8 @@ class _Kernels:
 
     @ti.func
     def push_out(self, p):
-        """A particle inside an obstacle goes back along the normal and meets the same condition as a node (``sim.mpm.walls.solid``).
-
-        Nodes outside stay free however near they are, so part of the reaction is missing on the grid; here it is made up, with its
-        friction. Twice, for a notch between two slopes.
+        """A particle inside an obstacle goes back along the normal, stopped and rubbed (``sim.mpm.walls.solid``): surfaces are straight
+        for the grid only within a column. Twice, for a notch between two slopes.
         """
         for _ in ti.static(range(2)):
             x = self.x[p]
@@ -345,6 +347,102 @@ class _Kernels:
                     self.v[p][d] = u[d]
                     moved = x[d] + (HAIR - distance) * normal[d]
                     self.x[p][d] = ti.min(ti.max(moved, ti.cast(self.extent[0][d], ti.f32) + HAIR), ti.cast(self.extent[1][d], ti.f32) - HAIR)
+
+    @ti.func
+    def column(self, k):
+        """Node at the surface of an obstacle, the step outwards, the nodes behind it; weights at the surface of the node and of the next one."""
+        node, step = ti.Vector.zero(ti.i32, self.dim), ti.Vector.zero(ti.i32, self.dim)
+        for d in ti.static(range(self.dim)):
+            node[d], step[d] = self.foot[k][d], self.foot[k][self.dim + d]
+        near = self.face[k][self.dim + 1]
+        if self.grid[node + step][self.dim] <= 0.0:
+            near = 1.0
+        return node, step, near
+
+    @ti.func
+    def resist(self, dt):
+        """Obstacles: across their surfaces velocities are linear along each column of nodes, and do not enter where they meet it.
+
+        v_k = v0 + k (v0 - v1) for the k-th node behind node 0, that nearest to the surface; v1 is the next one outwards. As at the walls
+        (``fold``) what particles gave to those nodes acts on v0 and v1 by virtual power, M v = r with M = sum m_k c_k c_k^T, r = sum p_k c_k,
+        c_k = (1 + k, -k). The velocity at the surface is u = a v0 + (1 - a) v1; J >= 0 along the normal and |J_t| <= mu J_n (all of it
+        where it is sticky) change v by M^-1 (a, 1 - a) J, which loses energy at most. Columns that share nodes take turns until they agree
+        (projected Gauss-Seidel). Were the nodes inside held instead, the lowest layers of resting water read up to five times their
+        pressure, as the surface lies between nodes.
+        """
+        for k in range(self.columns[None]):
+            node, step, near = self.column(k)
+            m0, m1 = self.grid[node][self.dim], self.grid[node + step][self.dim]
+            self.impulse[k] = ti.Vector.zero(ti.f32, self.dim + 2)
+            if m0 > 0.0:
+                M00, M01, M11 = m0, 0.0, m1
+                r0, r1 = self.grid[node], self.grid[node + step]
+                for i in range(1, self.foot[k][2 * self.dim] + 1):
+                    ghost = self.grid[node - i * step]
+                    # Without a mass at node 1 they move with node 0.
+                    c1 = ti.select(m1 > 0.0, -float(i), 0.0)
+                    c0, m = 1.0 - c1, ghost[self.dim]
+                    M00, M01, M11 = M00 + c0 * c0 * m, M01 + c0 * c1 * m, M11 + c1 * c1 * m
+                    r0, r1 = r0 + c0 * ghost, r1 + c1 * ghost
+                # Without it M is diagonal, and its second entry any number.
+                M11 = ti.select(m1 > 0.0, M11, 1.0)
+                det = M00 * M11 - M01 * M01
+                v0, v1 = (M11 * r0 - M01 * r1) / det, (M00 * r1 - M01 * r0) / det
+                for d in ti.static(range(self.dim)):
+                    self.grid[node][d] = m0 * v0[d]
+                    if m1 > 0.0:
+                        self.grid[node + step][d] = m1 * v1[d]
+                self.impulse[k][self.dim] = m0 * (M11 * near - M01 * (1.0 - near)) / det
+                self.impulse[k][self.dim + 1] = m1 * (M00 * (1.0 - near) - M01 * near) / det
+        sweep, change, largest = 0, 1.0, 0.0
+        while sweep < SWEEPS and change > SETTLED * largest:
+            sweep += 1
+            change = 0.0
+            for k in range(self.columns[None]):
+                node, step, near = self.column(k)
+                m0, m1 = self.grid[node][self.dim], self.grid[node + step][self.dim]
+                if m0 > 0.0:
+                    give0, give1 = self.impulse[k][self.dim], self.impulse[k][self.dim + 1]
+                    a, b = near / m0, 0.0
+                    if m1 > 0.0:
+                        b = (1.0 - near) / m1
+                    u, old, normal = ti.Vector.zero(ti.f32, self.dim), ti.Vector.zero(ti.f32, self.dim), ti.Vector.zero(ti.f32, self.dim)
+                    for d in ti.static(range(self.dim)):
+                        u[d] = a * self.grid[node][d] + b * self.grid[node + step][d] + dt * self.pull[None][d]
+                        old[d], normal[d] = self.impulse[k][d], self.face[k][d]
+                    stuck = old - u / (a * give0 + b * give1)
+                    pressed = stuck.dot(normal)
+                    now = ti.max(pressed, 0.0) * normal
+                    if ti.static(self.structure.obstacles == "coulomb"):
+                        friction = self.face[k][self.dim]
+                        along = stuck - pressed * normal
+                        share = 0.0
+                        if pressed > 0.0:
+                            share = ti.min(1.0, friction * pressed / ti.max(along.norm(), 1e-30))
+                        for d in ti.static(range(self.dim)):
+                            now[d] = ti.select(friction < 0.0, stuck[d], now[d] + share * along[d])
+                    for d in ti.static(range(self.dim)):
+                        self.impulse[k][d] = now[d]
+                        self.grid[node][d] += give0 * (now[d] - old[d])
+                        if m1 > 0.0:
+                            self.grid[node + step][d] += give1 * (now[d] - old[d])
+                    change = ti.max(change, (now - old).norm())
+                    largest = ti.max(largest, now.norm())
+
+    @ti.func
+    def stretch(self):
+        """Velocities of the nodes behind the obstacles' surfaces (``resist``), after the nodes' update."""
+        for k in range(self.columns[None]):
+            node, step, near = self.column(k)
+            v0 = self.grid[node]
+            if v0[self.dim] > 0.0:
+                slope = ti.Vector.zero(ti.f32, 4)
+                if self.grid[node + step][self.dim] > 0.0:
+                    slope = v0 - self.grid[node + step]
+                for i in range(1, self.foot[k][2 * self.dim] + 1):
+                    # Without mass none is read, nor cleared.
+                    if self.grid[node - i * step][self.dim] > 0.0:
+                        self.grid[node - i * step] = v0 + float(i) * slope
 
     @ti.func
     def shake(self, sums: ti.template()):
@@ -398,6 +496,8 @@ class _Kernels:
     def collect(self, low, high, dt):
         """Nodes, walls and ghosts, then grid to particles; leaves the grid empty. Returns the largest squared speed."""
         self.at_walls(low, high, dt, before=True)
+        if ti.static(self.structure.obstacles != "none"):
+            self.resist(dt)
         if ti.static(self.dim == 2):
             for i in range(low[0], high[0] + 3):
                 for j in range(low[1], high[1] + 3):
@@ -407,6 +507,8 @@ class _Kernels:
                 for j in range(low[1], high[1] + 3):
                     for k in range(low[2], high[2] + 3):
                         self.update_node(ti.Vector([i, j, k]), dt)
+        if ti.static(self.structure.obstacles != "none"):
+            self.stretch()
         self.at_walls(low, high, dt, before=False)
         fastest = 0.0
         if ti.static(self.has_rigid):
@@ -523,8 +625,14 @@ class _Kernels:
             for I in ti.grouped(self.grid):
                 if I[axis] < 2:
                     self.ghost(axis, I[axis], I, dt, True)
+        if ti.static(self.structure.obstacles != "none"):
+            for _ in range(1):
+                self.resist(dt)
         for I in ti.grouped(self.grid):
             self.update_node(I, dt)
+        if ti.static(self.structure.obstacles != "none"):
+            for _ in range(1):
+                self.stretch()
         for axis in ti.static(range(self.dim)):
             for I in ti.grouped(self.grid):
                 if I[axis] < 2:
@@ -585,8 +693,15 @@ class _Kernels:
             self.rigid.keep(back)
 
     @ti.kernel
-    def load_solids(self, values: ti.types.ndarray(ti.f32, 2)):
-        """[nodes, dim + 2] in the order of the grid's indices."""
+    def load_solids(self, values: ti.types.ndarray(ti.f32, 2), table: ti.types.ndarray(ti.f32, 2)):
+        """[nodes, dim + 2] in the order of the grid's indices; columns as ``column_table`` writes them."""
+        for _ in range(1):
+            self.columns[None] = table.shape[0]
+        for k in range(table.shape[0]):
+            for lane in ti.static(range(2 * self.dim + 1)):
+                self.foot[k][lane] = ti.cast(table[k, lane], ti.i32)
+            for lane in ti.static(range(self.dim + 2)):
+                self.face[k][lane] = table[k, 2 * self.dim + 1 + lane]
         for I in ti.grouped(self.solids):
             row = 0
             for d in ti.static(range(self.dim)):
@@ -622,6 +737,59 @@ class _Kernels:
 def _frictions(scene: Scene) -> list:
     """Of each obstacle; the walls' unless it has its own."""
     return [scene.walls.friction if obstacle.friction is None else obstacle.friction for obstacle in scene.obstacles]
+
+
+def column_table(obstacles: list, frictions: list, lower: np.ndarray, dx: float, nodes: tuple[int, ...]) -> np.ndarray:
+    """Where obstacles act on the grid (``_Kernels.resist``), [k, 3 dim + 3] float32: node, step, nodes behind, normal, friction, weight.
+
+    A column starts at each node inside whose neighbour, along the main direction of its normal, is outside. Node 0 is the one of the two
+    that is nearer to the surface, so that it never lacks mass where those behind have it; the column with the shallowest start has what
+    several could claim. What is inside, within reach of particles, and in no column is held by itself (weight 1, step 0): corners, and all that
+    is thinner than ``THICK``, lest particles beyond a plate be moved through the nodes they share.
+    """
+    dim, shape = len(nodes), np.array(nodes)
+    index = np.stack(np.meshgrid(*[np.arange(n) for n in nodes], indexing="ij"), -1).reshape(-1, dim)
+    distance, normal, nearest = combine(obstacles, lower + (index - WALL) * dx)
+    distance /= dx
+    inside = distance <= 0
+    friction = np.array([STICKY if kind == "sticky" else kind for kind in frictions])
+
+    def flat(at):
+        """Rows of ``index``, -1 off the grid."""
+        return np.where(((at >= 0) & (at < shape)).all(-1), np.ravel_multi_index(tuple(np.moveaxis(at, -1, 0)), nodes, mode="clip"), -1)
+
+    near = np.flatnonzero(inside & (distance > -REACH))
+    near = near[np.argsort(-distance[near], kind="stable")]
+    thin = np.zeros(len(index), bool)
+    thin[near] = combine(obstacles, lower + (index[near] - (THICK + distance[near, None]) * normal[near] - WALL) * dx)[0] > 0
+    step = (np.abs(normal[near]) == np.abs(normal[near]).max(1, keepdims=True)).cumsum(1).cumsum(1) == 1  # the first of equal ones
+    step = step * np.where(normal[near] > 0, 1, -1)
+    out = flat(index[near] + step)
+    depth = distance[near] / (distance[near] - distance[out])
+    shallow = depth <= 0.5
+    node = np.where(shallow, near, out)
+    after = flat(index[node] + step)
+    starts = np.flatnonzero(~thin[near] & (out >= 0) & ~inside[out] & (after >= 0) & ~inside[after])
+    starts = starts[np.sort(np.unique(node[starts], return_index=True)[1])]
+    near_of, node, step, depth, shallow = near[starts], node[starts], step[starts], depth[starts], shallow[starts]
+
+    claimed = np.zeros(len(index), bool)
+    claimed[node] = True
+    behind, growing = np.zeros(len(node), int), np.ones(len(node), bool)
+    for k in range(1, BEHIND + 1):
+        ghost = flat(index[node] - k * step)
+        growing &= (ghost >= 0) & inside[ghost] & ~thin[ghost] & ~claimed[ghost]
+        mine = np.zeros(len(node), bool)
+        mine[np.flatnonzero(growing)[np.unique(ghost[growing], return_index=True)[1]]] = True
+        growing &= mine
+        behind[growing] = k
+        claimed[ghost[growing]] = True
+    _, facing, which = combine(obstacles, lower + (index[near_of] + depth[:, None] * step - WALL) * dx)
+    weight = np.where(shallow, 1 - depth, 2 - depth)
+    columns = np.column_stack([index[node], step, behind, facing, friction[which], weight])
+    held = near[~claimed[near]]
+    zero, one = np.zeros((len(held), dim + 1)), np.ones(len(held))
+    return np.concatenate([columns, np.column_stack([index[held], zero, normal[held], friction[nearest[held]], one])]).astype(np.float32)
 
 
 class MPMSimulator:
@@ -664,9 +832,9 @@ class MPMSimulator:
         particles = scene.particles(self._refine(scene))
         structure, nodes = self._structure(scene), tuple(int(c) + 2 * WALL + 1 for c in self._cells(scene))
         capacity = _capacity(len(particles.position))
-        old, fresh = self._kernels, False
-        if old is None or old.structure != structure or old.nodes != nodes or old.capacity < capacity:
-            self._kernels, fresh = _Kernels(structure, capacity, nodes, serial), True
+        old, fresh, columns = self._kernels, False, self._columns(scene, nodes)
+        if old is None or old.structure != structure or old.nodes != nodes or old.capacity < capacity or old.columns_at_most < len(columns):
+            self._kernels, fresh = _Kernels(structure, capacity, nodes, _power_of_two(len(columns)), serial), True
         kernels = self._kernels
         lower, upper = np.array(scene.bounds).T
         cells = self._cells(scene)
@@ -684,7 +852,7 @@ class MPMSimulator:
         data = np.ascontiguousarray(np.concatenate([cell, particles.velocity], 1).astype(np.float32))
         kernels.load(data, self._table(scene, particles, cells))
         if structure.obstacles != "none":
-            kernels.load_solids(self._solids(scene, nodes))
+            kernels.load_solids(self._solids(scene, nodes), columns)
         if structure.rigid:
             kernels.load_rigid(body_table(scene, particles, data[:, : scene.dim].astype(float), self.dx, WALL, structure.rigid[1]))
         self._acceleration, self._frame, self._boundary = scene.acceleration(), 0, scene.boundary.astype(np.float32)
@@ -719,6 +887,11 @@ class MPMSimulator:
         distance, normal, nearest = combine(scene.obstacles, at)
         friction = np.array([STICKY if kind == "sticky" else kind for kind in _frictions(scene)])[nearest]
         return np.concatenate([normal, distance[:, None] / self.dx, friction[:, None]], 1).astype(np.float32)
+
+    def _columns(self, scene: Scene, nodes: tuple[int, ...]) -> np.ndarray:
+        if not scene.obstacles:
+            return np.zeros((0, 0), np.float32)
+        return column_table(scene.obstacles, _frictions(scene), np.array(scene.bounds)[:, 0], self._spacing(scene), nodes)
 
     def _refine(self, scene: Scene) -> int:
         return scene.refine if self.settings["particles"] == "teacher" else 1
@@ -834,6 +1007,9 @@ class MPMSimulator:
         fields["grid"] = (16, nodes)
         if structure.obstacles != "none":
             fields["signed distance"] = (4 * (dim + 2), nodes)
+            columns = _power_of_two(len(self._columns(scene, tuple(int(c) + 2 * WALL + 1 for c in cells))))
+            fields |= {"obstacle foot": (4 * (2 * dim + 1), columns), "obstacle face": (4 * (dim + 2), columns),
+                       "obstacle impulse": (4 * (dim + 2), columns)}
             kernels.append("load_solids")
         if structure.rigid is None:
             left_out["rigid bodies"] = "none in the scene"

@@ -1,4 +1,4 @@
-"""Walls of the container and obstacles as conditions on grid nodes."""
+"""Walls of the container as conditions on grid nodes, obstacles as one on what enters them."""
 
 from sim.taichi_runtime import ti
 
@@ -28,7 +28,7 @@ def wall(v, node, low, high, friction: ti.template(), coefficient):
 
 @ti.func
 def solid(v, value, friction: ti.template()):
-    """Velocity of a grid node in or on an obstacle; ``value`` is (normal [dim], distance, friction), friction < 0 is sticky.
+    """Velocity of a particle in or on an obstacle; ``value`` is (normal [dim], distance, friction), friction < 0 is sticky.
 
     As at a wall: no velocity into the solid, Coulomb friction on the rest, free to leave. ``friction``: "slip" or "coulomb".
     """

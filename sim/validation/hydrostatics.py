@@ -1,5 +1,7 @@
 """Hydrostatics: the pressure p = rho g (H - y) under water at rest."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from sim.mpm.solver import MPMSimulator
@@ -9,25 +11,37 @@ NUMBER = 3
 #: Cells along the box; the water is half as deep.
 RESOLUTIONS = (16, 32, 64)
 H, C, RHO, G = 0.5, 40.0, 1000.0, 9.8
+OFFSETS = (0.25, 0.5, 0.75)
 
 
 def run(resolution: int) -> Outcome:
     """Water over the full width of a unit box. It starts at reference density and rings at 4 H / c, ten frames: means over ten periods after
-    the first ten, of the particles of a layer of cells, as forces come from the grid."""
-    what = scene(
-        "hydrostatics", {"model": "water", "sound_speed": C, "density": RHO}, [{"kind": "box", "lower": [0.0, 0.0], "upper": [1.0, H]}],
-        [[0.0, 1.0], [0.0, 1.0]], [resolution] * 2, 4 * H / C / 10, gravity=[0.0, -G],
-    )  # fmt: skip
+    the first ten, of the particles of a layer of cells, as forces come from the grid. The same on the plane surface of an obstacle, which
+    lies a quarter, half and three quarters of a cell above a line of nodes: the worst of the three."""
+    curves, seconds, particles = _pool(resolution, MPMSimulator())
     solver = MPMSimulator()
+    worst = max((_pool(resolution, solver, offset) for offset in OFFSETS), key=lambda found: found[0]["pressure"].error)
+    curves["over an obstacle"] = replace(worst[0]["pressure"], label="relative L2 error of the pressure over an obstacle")
+    return Outcome("hydrostatics", resolution, particles, curves, seconds + 3 * worst[1])
+
+
+def _pool(resolution: int, solver: MPMSimulator, offset: float | None = None) -> tuple[dict[str, Curve], float, int]:
+    """Curves, seconds and particles, on the box's floor or on an obstacle's surface ``offset`` cells above a line of nodes."""
+    floor = 0.0 if offset is None else (3 + offset) / resolution
+    what = scene(
+        "hydrostatics", {"model": "water", "sound_speed": C, "density": RHO},
+        [{"kind": "box", "lower": [0.0, floor], "upper": [1.0, floor + H]}], [[0.0, 1.0], [0.0, 1.0]], [resolution] * 2, 4 * H / C / 10,
+        gravity=[0.0, -G], obstacles=[] if offset is None else [{"kind": "halfspace", "point": [0.5, floor], "normal": [0.0, 1.0]}],
+    )  # fmt: skip
     solver.load(what)
 
     def observe(_):
         state = solver.state()
-        return RHO * C**2 / 7 * (state["stuff.J"] ** -7 - 1), state["position"][:, 1], solver.diagnostics()["kinetic_energy"]
+        return RHO * C**2 / 7 * (state["stuff.J"] ** -7 - 1), state["position"][:, 1] - floor, solver.diagnostics()["kinetic_energy"]
 
     found, seconds = timed(solver.frame, 200, observe)
     pressure, level, kinetic = (np.mean(series[100:], 0) for series in zip(*found, strict=True))
-    row = np.round(what.particles().position[:, 1] / what.spacing - 0.5).astype(int)
+    row = np.round((what.particles().position[:, 1] - floor) / what.spacing - 0.5).astype(int)
     p, y = (np.bincount(row // 2, values) / np.bincount(row // 2) for values in (pressure, level))
     exact, unit = RHO * G * (H - y), RHO * G * H
     loss = float(1 - (level[row == row.max()].mean() + what.spacing / 2) / H)
@@ -39,4 +53,4 @@ def run(resolution: int) -> Outcome:
         "rest": Curve("kinetic energy / rho g H V", ("", "kinetic energy / rho g H V"), np.array([0.0, 1.0]), np.zeros(2),
                       np.full(2, still), still, 1e-3),
     }  # fmt: skip
-    return Outcome("hydrostatics", resolution, len(row), curves, seconds)
+    return curves, seconds, len(row)

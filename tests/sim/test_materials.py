@@ -18,6 +18,7 @@ from experiments import Experiments  # noqa: E402
 
 from sim.mpm.decomposition import decompose, log1p_excess  # noqa: E402
 from sim.mpm.materials import MODELS  # noqa: E402
+from sim.mpm.materials.strain import CRUSHED  # noqa: E402
 from sim.mpm.solver import WALL, MPMSimulator  # noqa: E402
 from sim.plan import RATES, plan_text  # noqa: E402
 from sim.scene import Elastic, Goop, Sand, Scene, SceneFamily, Snow, Water  # noqa: E402
@@ -507,6 +508,20 @@ def test_viscosity_bounds_the_time_step():
         binding = planned[0] == int(np.ceil(0.01 / limit))
         assert binding == (eta == 2000.0)
         assert solver.diagnostics()["substeps"] == (planned[0] if binding else pytest.approx(planned[0], abs=3))
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("name", ["sand", "goop", "snow"])
+def test_crushed_beyond_float32_it_stays_at_the_smallest_volume(name, dim):
+    """Halved forty times along each axis, exactly 2^-40: b - I would round to -1 and less. Singular values stay 1e-3 (``CRUSHED``)."""
+    grains = samples(name, dim)
+    for _ in range(40):
+        stress = grains.strain(np.broadcast_to(-0.5 * np.eye(dim), (N, dim, dim)))
+        assert grains.intact.all()
+    smallest = 0.25 * (1 + CRUSHED)  # the last halving, whose trial is what is stored
+    stored = grains.model.b.to_numpy()[:N, :dim]
+    assert ((stored >= CRUSHED - EPS) | (np.abs(1 + stored - smallest) < EPS)).all()
+    assert np.isfinite(stress).all() and (np.einsum("nii->n", stress) < 0).all()
 
 
 @pytest.mark.parametrize("model", ["goop", "elastic", "sand", "snow"])
