@@ -15,6 +15,7 @@ import ctypes
 import multiprocessing
 import os
 import platform
+import resource
 import shutil
 import subprocess
 import tempfile
@@ -216,7 +217,8 @@ def first_calls(case: tuple) -> dict:
 
 
 def _resident() -> float:
-    """Bytes of this process in memory."""
+    """Bytes of this process in memory, less what the allocator keeps of what is freed."""
+    ctypes.CDLL(None).malloc_trim(0)
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
@@ -234,13 +236,15 @@ def _memory(material: str, dim: int, size: tuple, frames: int) -> dict:
     spent, substeps = timed(partial(advance, simulator, frames))
     grown, planned, count = _resident() - before, simulator.plan(scene), len(scene.particles().position)
     grid = int(np.multiply(*planned["fields"]["grid"]))
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 - before
     return {"case": f"memory, {scene.name}", "particles": count, "grid_bytes": grid, "planned_bytes_a_particle": (planned["bytes"] - grid) / count,
-            "resident_bytes_a_particle": (grown - grid) / count, "load_seconds": loaded, "frames": frames, "substeps": sum(substeps),
+            "resident_bytes_a_particle": (grown - grid) / count, "peak_bytes_a_particle": (peak - grid) / count, "load_seconds": loaded, "frames": frames, "substeps": sum(substeps),
             "taichi_mps": count * sum(substeps) / spent / 1e6}  # fmt: skip
 
 
 def memory(material: str, dim: int, size: tuple, frames: int = 1) -> dict:
-    """What a scene takes in a fresh process beside its grid, by ``plan`` and by the process's growth; its speed over some frames."""
+    """What a scene takes in a fresh process beside its grid, by ``plan`` and by the process's growth, then and at its peak; its speed over some
+    frames."""
     return _alone(_memory, material, dim, size, frames)
 
 
@@ -309,7 +313,8 @@ def main() -> None:
         os.environ["SLUICE_TAICHI_CACHE"] = f"{folder}/kernels"
         for material in ("water", "sand"):
             rows.append(memory(material, 3, LARGE_3D))
-            print("{case}: {planned_bytes_a_particle:.0f} bytes a particle planned, {resident_bytes_a_particle:.0f} resident, beside the grid; "
+            print("{case}: {planned_bytes_a_particle:.0f} bytes a particle planned, {resident_bytes_a_particle:.0f} resident, "
+                  "{peak_bytes_a_particle:.0f} at the peak, while it loads, beside the grid; "
                   "{taichi_mps:.2f} Mps".format(**rows[-1]), flush=True)  # fmt: skip
         pair = two_processes(400, rounds)
         if pair:

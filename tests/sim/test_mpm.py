@@ -656,6 +656,6 @@ def test_room_for_particles(particles, capacity):
 def test_two_materials_in_3d_allocate_what_the_plan_says(built):
     simulator = MPMSimulator()
     promised = simulator.plan(POND)
-    kernels = solver_module._Kernels(simulator._structure(POND), solver_module._capacity(promised["particles"]), (19, 19, 19), True)
+    kernels = solver_module._Kernels(simulator._structure(POND), solver_module._capacity(promised["particles"]), (19, 19, 19), 0, True)
     assert sorted(each for each in built["fields"] if each[1] > 8) == sorted(map(tuple, promised["fields"].values()))
     assert len(kernels.state) == len(kernels.saved) == 5 + 1 + 2, "x, v, three columns of C; J; b and volume gain"

@@ -7,6 +7,8 @@ from sim.taichi_runtime import ti
 
 #: Smallest eigenvalue of b - I that a principal return map keeps.
 CRUSHED = -0.999999
+#: Below it is no rounding of -1: b has no such eigenvalue, and is broken.
+IMPOSSIBLE = -1.001
 
 
 def lame(material, stiffness: float) -> tuple[float, float]:
@@ -147,11 +149,13 @@ class Principal(LeftCauchyGreen):
         if self.sound(p, gradient_dt):
             trial = pack(push_forward(unpack(self.b[p]), gradient_dt))
             values, frame = decompose(trial)
-            e, moved = self.return_map(p, self.hencky(values), dt)
-            tau = unpack(assemble(self.stress(p, e), frame))
-            kept = trial
-            if moved or values.min() < CRUSHED:
-                kept = assemble(ti.Vector([expm1(2.0 * e[i]) for i in ti.static(range(self.dim))]), frame)
+            least = values.min()
+            if least > IMPOSSIBLE:
+                e, moved = self.return_map(p, self.hencky(values), dt)
+                tau = unpack(assemble(self.stress(p, e), frame))
+                kept = trial
+                if moved or least < CRUSHED:
+                    kept = assemble(ti.Vector([expm1(2.0 * e[i]) for i in ti.static(range(self.dim))]), frame)
         self.b[p] = kept
         return tau
 
