@@ -61,6 +61,7 @@ def _left(edges: np.ndarray) -> np.ndarray:
 
 class _Solid(Strict):
     friction: Friction | None = None
+    _walls: np.ndarray | None = None  # [dim, 2]: the box's, where what lies on or beyond them is no surface (``within``)
 
     def extent(self) -> tuple[np.ndarray, np.ndarray] | None:
         """Lower and upper corner of the bounding box; None for what has no end."""
@@ -68,6 +69,21 @@ class _Solid(Strict):
 
     def distance(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         raise NotImplementedError
+
+    def _beyond(self, corners: np.ndarray) -> np.ndarray:
+        """[m]: faces or edges, by their corners [m, k, dim], that lie on or beyond one of the walls."""
+        if self._walls is None:
+            return np.zeros(len(corners), bool)
+        hair = 1e-9 * np.ptp(self._walls)
+        low, high = self._walls.T
+        return ((corners <= low + hair).all(1) | (corners >= high - hair).all(1)).any(1)
+
+    def _into(self, points: np.ndarray) -> np.ndarray:
+        """``points``, those on or beyond a wall a hair inside, where it is plain what is solid."""
+        if self._walls is None:
+            return points
+        hair = 1e-7 * np.ptp(self._walls)
+        return np.clip(points, self._walls[:, 0] + hair, self._walls[:, 1] - hair)
 
 
 class Segment(_Solid):
@@ -103,13 +119,15 @@ class Polygon(_Solid):
         following = np.roll(corners, -1, axis=0)
         area = (corners[:, 0] * following[:, 1] - corners[:, 1] * following[:, 0]).sum()
         edges = np.stack([corners, following], 1)
-        foot, which = _nearest(points, edges)
-        inside = np.zeros(len(points), bool)
+        inside, near = np.zeros(len(points), bool), self._into(points)
         for a, b in edges:  # the number of edges that a ray to the right crosses is odd inside
-            spans = (a[1] > points[:, 1]) != (b[1] > points[:, 1])
+            spans = (a[1] > near[:, 1]) != (b[1] > near[:, 1])
             if spans.any():
-                cut = a[0] + (points[spans, 1] - a[1]) / (b[1] - a[1]) * (b[0] - a[0])
-                inside[spans] ^= points[spans, 0] < cut
+                cut = a[0] + (near[spans, 1] - a[1]) / (b[1] - a[1]) * (b[0] - a[0])
+                inside[spans] ^= near[spans, 0] < cut
+        hidden = self._beyond(edges)
+        edges = edges[~hidden] if not hidden.all() else edges
+        foot, which = _nearest(points, edges)
         return _signed(points, foot, inside, (-np.sign(area) * _left(edges))[which])
 
 
@@ -156,6 +174,10 @@ class Box(_Solid):
 
     def distance(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         lower, upper = self.extent()
+        if self._walls is not None:
+            size, corner = 2 * np.ptp(self._walls) + np.abs(upper - lower).max(), np.stack([lower, upper])
+            (low, high), hair = self._walls.T, 1e-9 * np.ptp(self._walls)
+            lower, upper = np.where(corner[0] <= low + hair, low - size, lower), np.where(corner[1] >= high - hair, high + size, upper)
         offset = points - (lower + upper) / 2
         beyond = np.abs(offset) - (upper - lower) / 2
         axis, rows = beyond.argmax(1), np.arange(len(points))
@@ -194,7 +216,10 @@ class Mesh(_Solid):
         import pyvista
 
         cloud = pyvista.PolyData(np.ascontiguousarray(points, np.float64))
-        sign = np.asarray(cloud.compute_implicit_distance(surface)["implicit_distance"], float)
+        sign = np.asarray(pyvista.PolyData(self._into(cloud.points)).compute_implicit_distance(surface)["implicit_distance"], float)
+        hidden = self._beyond(np.asarray(surface.points, float)[np.asarray(surface.regular_faces)])
+        if hidden.any() and not hidden.all():
+            surface = surface.extract_cells(~hidden).extract_surface()
         cells, foot = surface.find_closest_cell(cloud.points, return_closest_point=True)
         return _signed(points, np.asarray(foot, float), sign < 0, np.asarray(surface.face_normals, float)[cells])
 
@@ -212,6 +237,18 @@ def closed_surface(vertices, faces):
 
 
 Obstacle = Annotated[Segment | Polygon | Floor | Ball | Box | Halfspace | Mesh, Field(discriminator="kind")]
+
+
+def within(obstacles: list, bounds: np.ndarray) -> list:
+    """The same solids as particles inside ``bounds`` [dim, 2] meet them: without the faces that lie on or beyond a wall.
+
+    A wedge in a corner or a plate from wall to wall goes on behind the walls. Were its ends surfaces, the nearest one beside a wall
+    would be the wall's own, and particles would be let down into the solid along it.
+    """
+    found = [obstacle.model_copy() for obstacle in obstacles]
+    for obstacle in found:
+        obstacle._walls = np.asarray(bounds, float)
+    return found
 
 
 def combine(obstacles: list, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

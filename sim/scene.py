@@ -25,7 +25,7 @@ from sim.fields import Finite, Friction, Positive, Range
 from sim.fields import Strict as _Strict
 from sim.fields import mistake as _mistake
 from sim.fields import sample as _sample
-from sim.obstacles import Obstacle, ObstacleFamily, boundary_particles, combine, outside
+from sim.obstacles import Obstacle, ObstacleFamily, boundary_particles, combine, outside, within
 from sim.trajectory import KINEMATIC_TYPE, PARTICLE_TYPES
 
 #: Names of the splits, in the order that seeds count them.
@@ -393,9 +393,14 @@ class Scene(_Physics):
         return Particles(position, velocity, material, bodies, np.flatnonzero(tracked), spacing if coarse else spacing / k)
 
     @cached_property
+    def surfaces(self) -> list:
+        """The obstacles as particles in the box meet them."""
+        return within(self.obstacles, np.array(self.bounds))
+
+    @cached_property
     def boundary(self) -> np.ndarray:
         """[k, dim] float64: the kinematic particles of the obstacles, at the recorded spacing."""
-        return boundary_particles(self.obstacles, np.array(self.bounds), self.spacing) if self.obstacles else np.empty((0, self.dim))
+        return boundary_particles(self.surfaces, np.array(self.bounds), self.spacing) if self.obstacles else np.empty((0, self.dim))
 
     def start(self) -> np.ndarray:
         """[recorded particles, dim] float64 at frame 0: those that move, then the kinematic ones."""

@@ -890,14 +890,14 @@ class MPMSimulator:
         """Normal, distance [cells] and friction of the obstacles at each node, [nodes, dim + 2] float32."""
         lower = np.array(scene.bounds)[:, 0]
         at = lower + (np.stack(np.meshgrid(*[np.arange(n) for n in nodes], indexing="ij"), -1).reshape(-1, scene.dim) - WALL) * self.dx
-        distance, normal, nearest = combine(scene.obstacles, at)
+        distance, normal, nearest = combine(scene.surfaces, at)
         friction = np.array([STICKY if kind == "sticky" else kind for kind in _frictions(scene)])[nearest]
         return np.concatenate([normal, distance[:, None] / self.dx, friction[:, None]], 1).astype(np.float32)
 
     def _columns(self, scene: Scene, nodes: tuple[int, ...]) -> np.ndarray:
         if not scene.obstacles:
             return np.zeros((0, 0), np.float32)
-        return column_table(scene.obstacles, _frictions(scene), np.array(scene.bounds)[:, 0], self._spacing(scene), nodes)
+        return column_table(scene.surfaces, _frictions(scene), np.array(scene.bounds)[:, 0], self._spacing(scene), nodes)
 
     def _refine(self, scene: Scene) -> int:
         return scene.refine if self.settings["particles"] == "teacher" else 1

@@ -6,7 +6,7 @@ import numpy as np
 
 from sim.stability import Cell
 from sim.stability.courant import MATERIALS
-from sim.stability.driver import ROUGH, follow, solver_for
+from sim.stability.driver import ROUGH, deep, follow, solver_for
 from sim.validation import scene
 
 CELLS, G = 16, 9.8
@@ -28,12 +28,14 @@ STARTS = {
 
 
 def run() -> list[Cell]:
-    """Water and rubber, half a second."""
+    """Water and rubber, half a second, in 2D and 3D."""
     cells = []
-    for name in ("water", "elastic"):
+    for dim, name in [(dim, name) for dim in (2, 3) for name in ("water", "elastic")]:
         for start, bodies in STARTS.items():
             begun, into = time.perf_counter(), []
             what = scene("contact", MATERIALS[name], bodies, [[0.0, 1.0]] * 2, [CELLS] * 2, 0.01, gravity=[0.0, -G], walls=ROUGH)
+            if dim == 3:
+                what = deep(what, *bodies[0]["lower"][:1], *bodies[0]["upper"][:1])
             run = follow(what, 1)
             for frames in (1, 49):
                 if frames > 1:
@@ -48,5 +50,5 @@ def run() -> list[Cell]:
             right = run.ok and inside and max(into) <= np.finfo(np.float32).eps * max(run.speed.max(initial=0.0), 1.0)
             observed = f"{'inside' if inside else 'outside'}, at most {max(into):.2g} m/s into a wall" if run.ok else run.status
             numbers = {"particles": len(run.position), "speed_into_wall": max(into), "fastest": float(run.speed.max(initial=0.0))}
-            cells.append(Cell("contact", f"{name}, {start}", right, EXPECTED, observed, numbers, time.perf_counter() - begun))
+            cells.append(Cell("contact", f"{name}, {start}{', 3D' if dim == 3 else ''}", right, EXPECTED, observed, numbers, time.perf_counter() - begun))
     return cells

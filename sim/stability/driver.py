@@ -16,6 +16,21 @@ ROUGH = {"friction": 0.5}
 _solvers: dict[str, MPMSimulator] = {}
 
 
+def deep(what: Scene, low: float, high: float) -> Scene:
+    """The same in 3D: bodies from ``low`` to ``high`` along a third axis, in a box as deep as it is wide; plates across all of it."""
+    content = what.to_dict()
+    for body in content["bodies"]:
+        body["lower"], body["upper"], body["velocity"] = [*body["lower"], low], [*body["upper"], high], [*body["velocity"], 0.0]
+    solids = [
+        {"kind": "box", "lower": [0.0, solid["start"][1] - solid["thickness"] / 2, 0.0],
+         "upper": [1.0, solid["end"][1] + solid["thickness"] / 2, 1.0]}
+        for solid in content.get("obstacles", [])
+    ]
+    bounds, cells = content["bounds"], content["cells"]
+    return Scene.from_dict(content | {"dim": 3, "bounds": [*bounds, bounds[0]], "cells": [*cells, cells[0]],
+                                      "gravity": [*content["gravity"], 0.0], "obstacles": solids})
+
+
 @dataclass(frozen=True)
 class Run:
     """What ``follow`` saw after each frame it got: arrays [frames]; ``energy`` [frames + 1] kinetic + potential + elastic, the start first;

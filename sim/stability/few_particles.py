@@ -7,7 +7,7 @@ import numpy as np
 from sim.errors import InputError
 from sim.scene import Scene, SceneFamily
 from sim.stability import Cell
-from sim.stability.driver import ROUGH, follow
+from sim.stability.driver import ROUGH, deep, follow
 from sim.stability.refusal import FAMILY
 from sim.validation import scene
 
@@ -18,20 +18,25 @@ ROUNDING = 1e-4
 
 
 def run() -> list[Cell]:
-    """In 2D; the parabola is that of symplectic Euler at the steps taken, x0 + v0 t + g t^2 / 2 + g dt t / 2 a frame."""
+    """The parabola is that of symplectic Euler at the steps taken, x0 + v0 t + g t^2 / 2 + g dt t / 2 a frame."""
     film = [{"kind": "box", "lower": [0.25, 0.75], "upper": [0.75, 0.75 + 0.5 / CELLS], "velocity": [0.5, 0.0]}]
     one = [{"kind": "box", "lower": [0.5, 0.5], "upper": [0.5 + 0.5 / CELLS] * 2, "velocity": [0.5, 1.0]}]
-    return [_flies("a film one particle thick", film, 50), _flies("one particle", one, 50), _rests(one), _empty()]
+    deep_film, deep_one = deep(_scene(film), 0.25, 0.75), deep(_scene(one), 0.5, 0.5 + 0.5 / CELLS)
+    return [
+        _flies("a film one particle thick", _scene(film)), _flies("a film one particle thick, 3D", deep_film), _flies("one particle", _scene(one)),
+        _flies("one particle, 3D", deep_one), _rests("one particle, two seconds on", _scene(one)),
+        _rests("one particle, two seconds on, 3D", deep_one), _empty(),
+    ]  # fmt: skip
 
 
 def _scene(bodies: list[dict]) -> Scene:
     return scene("few-particles", WATER, bodies, [[0.0, 1.0]] * 2, [CELLS] * 2, FRAME, gravity=[0.0, -G], walls=ROUGH)
 
 
-def _flies(cell: str, bodies: list[dict], frames: int) -> Cell:
-    begun, what = time.perf_counter(), _scene(bodies)
-    run, start = follow(what, frames), what.particles()
-    exact, velocity, g = start.position.copy(), start.velocity.copy(), np.array([0.0, -G])
+def _flies(cell: str, what: Scene) -> Cell:
+    begun = time.perf_counter()
+    run, start = follow(what, 50), what.particles()
+    exact, velocity, g = start.position.copy(), start.velocity.copy(), np.array(what.gravity)
     for n, dt in zip(run.substeps, run.dt, strict=True):
         exact += velocity * n * dt + g * dt**2 * n * (n + 1) / 2
         velocity += g * n * dt
@@ -42,15 +47,15 @@ def _flies(cell: str, bodies: list[dict], frames: int) -> Cell:
                 {"particles": len(exact), "error": error, "tolerance": ROUNDING}, time.perf_counter() - begun)  # fmt: skip
 
 
-def _rests(bodies: list[dict]) -> Cell:
+def _rests(cell: str, what: Scene) -> Cell:
     begun = time.perf_counter()
-    run = follow(_scene(bodies), 400)
+    run = follow(what, 400)
     x, speed = run.position[0], float(run.speed[-1]) if run.ok else np.nan
     # Within what gravity adds in a frame.
-    right = run.ok and 0 <= x[1] <= 1 / CELLS and 0 <= x[0] <= 1 and speed <= G * FRAME
-    return Cell("few_particles", "one particle, two seconds on", right, "rests on the floor, inside the walls",
+    right = run.ok and 0 <= x[1] <= 1 / CELLS and ((x >= 0) & (x <= 1)).all() and speed <= G * FRAME
+    return Cell("few_particles", cell, bool(right), "rests on the floor, inside the walls",
                 f"at height {x[1]:.3g} m, speed {speed:.3g} m/s" if run.ok else run.status, {"height": float(x[1]), "speed": speed},
-                time.perf_counter() - begun, {"one particle": run.energy_curve(run.energy[0])})  # fmt: skip
+                time.perf_counter() - begun, {cell: run.energy_curve(run.energy[0])})  # fmt: skip
 
 
 def _empty() -> Cell:

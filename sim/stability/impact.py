@@ -6,7 +6,7 @@ import numpy as np
 
 from sim.obstacles import combine
 from sim.stability import Cell
-from sim.stability.driver import ROUGH, follow, solver_for
+from sim.stability.driver import ROUGH, deep, follow, solver_for
 from sim.validation import scene
 
 MATERIALS = {
@@ -24,20 +24,23 @@ TARGETS = {"floor": [], "plate": [PLATE]}
 
 
 def run() -> list[Cell]:
-    """Each material thrown at the floor, and at a plate two cells thick; and one that may not bear it."""
-    return [_thrown(name, MATERIALS[name], target, obstacles) for name in MATERIALS for target, obstacles in TARGETS.items()] + [
-        _thrown("elastic, far too soft,", SOFT, "plate", TARGETS["plate"], may_fail=True)]
+    """Each material thrown at the floor, and at a plate two cells thick, in 2D and 3D; and one that may not bear it."""
+    return [_thrown(name, MATERIALS[name], target, dim) for dim in (2, 3) for name in MATERIALS for target in TARGETS] + [
+        _thrown("elastic, far too soft,", SOFT, "plate", may_fail=True)]
 
 
-def _thrown(name: str, material: dict, target: str, obstacles: list, may_fail: bool = False) -> Cell:
-    begun, cell = time.perf_counter(), f"{name} on a {target}"
+def _thrown(name: str, material: dict, target: str, dim: int = 2, may_fail: bool = False) -> Cell:
+    begun, cell = time.perf_counter(), f"{name} on a {target}{', 3D' if dim == 3 else ''}"
     body = {"kind": "box", "lower": [0.375, 0.5], "upper": [0.625, 0.75], "velocity": [0.0, -SPEED]}
-    what = scene("impact", material, [body], [[0.0, 1.0]] * 2, [CELLS] * 2, 5e-4, gravity=[0.0, -G], obstacles=obstacles, walls=ROUGH)
+    what = scene("impact", material, [body], [[0.0, 1.0]] * 2, [CELLS] * 2, 5e-4, gravity=[0.0, -G],
+                 obstacles=TARGETS[target], walls=ROUGH)
+    if dim == 3:
+        what = deep(what, 0.375, 0.625)
     run = follow(what, 60)
     rest = 0.4 / CELLS / (float(solver_for(what).plan(what)["wave_speed"]) + G * what.frame_step)
     x = run.position[: len(what.particles().position)]
     held = bool((x >= 0).all() and (x <= 1).all())
-    if obstacles:
+    if what.obstacles:
         held = held and float(combine(what.obstacles, x)[0].min()) > -1e-3 / CELLS and bool((x[:, 1] > 0.25).all())
     top, smallest = float((run.kinetic / run.energy[0]).max(initial=0.0)), float(run.dt.min(initial=np.inf))
     right = (run.ok or may_fail) and held and top <= 1 and smallest < rest

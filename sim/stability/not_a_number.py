@@ -50,7 +50,7 @@ def run() -> list[Cell]:
     cells = []
     for name, deformation in STATES.items():
         teacher = Poisoned()
-        for where in ("velocity", "velocity gradient", deformation):
+        for where in ("position", "velocity", "velocity gradient", deformation):
             for value in (np.nan, np.inf):
                 begun = time.perf_counter()
                 teacher.where, teacher.value = where, value

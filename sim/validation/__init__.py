@@ -51,10 +51,12 @@ class Outcome:
 
 
 def scene(name: str, material: dict, bodies: list[dict], bounds: list, cells: list[int], frame_step: float, **changes) -> Scene:
-    """A resolved 2D scene of one material ``stuff`` on a plain lattice; bodies as in ``sim.scene.Body``, at rest unless they say otherwise."""
-    bodies = [{"material": "stuff", "velocity": [0.0, 0.0]} | body for body in bodies]
+    """A resolved scene of one material ``stuff`` on a plain lattice, in as many dimensions as ``bounds`` has; bodies as in
+    ``sim.scene.Body``, at rest unless they say otherwise."""
+    still = [0.0] * len(bounds)
+    bodies = [{"material": "stuff", "velocity": still} | body for body in bodies]
     content = {
-        "name": name, "dim": 2, "bounds": bounds, "gravity": [0.0, 0.0], "frame_step": frame_step, "frames": 2, "cells": cells,
+        "name": name, "dim": len(bounds), "bounds": bounds, "gravity": still, "frame_step": frame_step, "frames": 2, "cells": cells,
         "radius": (bounds[0][1] - bounds[0][0]) / cells[0], "materials": {"stuff": material}, "seed": 0, "bodies": bodies,
     }
     return Scene.from_dict(content | changes)
