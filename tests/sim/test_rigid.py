@@ -227,9 +227,10 @@ def tumble(inertia, spin, seconds, steps=4000):
     return w, R @ w
 
 
-def test_a_brick_that_turns_about_its_middle_axis_turns_over(blocks_3d):
-    """Dzhanibekov: in 2 s it turns over once, from 1.7 s on. First order in dt: half the step, half the error, and their extrapolation is right."""
-    start, found, gained = [0.3, 6.0, 0.0], {}, {}
+@pytest.fixture(scope="module")
+def flights(blocks_3d):
+    """A free brick spun about its middle axis, for 2 s in steps of 0.01 and 0.005 s: (spins at the end, relative gains of energy, exact spin)."""
+    start, spins, gains = [0.3, 6.0, 0.0], [], []
     for step in (0.01, 0.005):
         what = scene([("wood", box([0.3125, 0.375, 0.4375], [0.6875, 0.625, 0.5625]))], dim=3, gravity=[0.0] * 3, frame_step=step, frames=401)
         blocks_3d.load(what)
@@ -237,15 +238,27 @@ def test_a_brick_that_turns_about_its_middle_axis_turns_over(blocks_3d):
         kinetic = energy(blocks_3d)
         for _ in range(round(2 / step)):
             blocks_3d.frame()
-        found[step], gained[step] = blocks_3d._kernels.rigid.spin.to_numpy()[0], energy(blocks_3d) / kinetic - 1
+        spins.append(blocks_3d._kernels.rigid.spin.to_numpy()[0].astype(float))
+        gains.append(energy(blocks_3d) / kinetic - 1)
     particles = what.particles().position
     arm, mass = particles - particles.mean(0), 600 * what.spacing**3
     second = mass * (arm.T @ arm + len(arm) * blocks_3d.dx**2 / 4 * np.eye(3))
     inside, exact = tumble(np.trace(second) * np.eye(3) - second, start, 2.0)
-    assert inside[1] < -3, "it turns over"
-    assert np.abs(found[0.005] - exact).max() < 0.15, "2.5 per cent of the spin"
-    assert np.abs(2 * found[0.005] - found[0.01] - exact).max() < 0.03
-    assert abs(gained[0.005]) < 0.025 and gained[0.005] == pytest.approx(gained[0.01] / 2, rel=0.1)
+    assert inside[1] < -3, "it turns over, from 1.7 s on"
+    return spins, gains, exact
+
+
+def test_a_brick_that_turns_about_its_middle_axis_turns_over(flights):
+    """Dzhanibekov. At least first order in dt: 2.5 per cent off at the finer step, half a per cent after extrapolation."""
+    (coarse, fine), gains, exact = flights
+    assert np.abs(fine - exact).max() < 0.15
+    assert np.abs(2 * fine - coarse - exact).max() < 0.03
+    assert abs(gains[1]) < 0.025
+
+
+@pytest.mark.xfail(strict=True, reason="4 % of energy in 2 s at dt 0.01: a substep turns by the spin at its start; by that at its middle: -6e-5")
+def test_a_turning_brick_gains_no_energy(flights):
+    assert max(flights[1]) < 1e-3
 
 
 def test_a_cube_falls_and_rests_at_half_its_height(blocks_3d):
@@ -268,7 +281,7 @@ def test_a_cube_falls_and_rests_at_half_its_height(blocks_3d):
         pytest.param([0.625, 0.375, 0.375], 2e-6, id="centre to centre"),
         pytest.param(
             [0.625, 0.4375, 0.3125], 2e-6, id="off centre",
-            marks=pytest.mark.xfail(strict=True, reason="3e-5 of the momenta: 60 sweeps over 128 contacts add their pushes to V in float32"),
+            marks=pytest.mark.xfail(strict=True, reason="3e-5 of the momenta: sweeps over 128 contacts add up V in float32; in float64: 3e-7"),
         ),
     ],
 )  # fmt: skip
