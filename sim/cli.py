@@ -156,6 +156,10 @@ def _export(options: argparse.Namespace) -> int:
     done = export(options.source, options.out, options.format, split=options.split, index=options.index, frames=options.frames)
     for split, index, status in done.failed:
         print(f"left out: {split} {index:06d}: {status}")
+    if done.left_out:
+        other = "deepmind" if options.format in ("geoelements", "lagrangebench") else "vtkhdf"
+        print(f"sluice-sim: {options.out}: context = {', '.join(done.left_out)}: left out, {options.format} has no place for it; {other} has",
+              file=sys.stderr)  # fmt: skip
     counts = ", ".join(f"{split or 'shard'} {count}" for split, count in done.trajectories.items())
     print(f"{options.out}: trajectories as {options.format}: {counts}; {len(done.failed)} failed left out")
     return 0

@@ -11,9 +11,16 @@ lagrangebench   ``<split>.h5``, ``metadata.json``                               
 ==============  ======================================================================  ================================
 
 Positions keep their float32 bits everywhere; viewers get z = 0 in 2D, and velocities [length / s]. Failed trajectories are in no
-export. Layouts are taken from what reads them: VTK's specification and ``vtkHDFReader``; ``gns/data_loader.py`` of geoelements;
-``learning_to_simulate/reading_utils.py`` and the message definitions of TensorFlow (``example.proto``, ``feature.proto``);
+export. Layouts are taken from what reads them: VTK's specification and ``vtkHDFReader``; ``gns/data_loader.py`` and ``gns/train.py`` of
+geoelements; ``learning_to_simulate/reading_utils.py`` and the message definitions of TensorFlow (``example.proto``, ``feature.proto``);
 ``lagrangebench/data/data.py`` and that project's own converter of DeepMind's data (``tfrecord_to_h5.py``).
+
+A context goes where its reader looks for one. deepmind: all of it (``step_context``). vtkhdf: all of it, as field data of each step.
+geoelements: a lone material number (its ``material_property``, constant in time), but no container's acceleration. lagrangebench, ply and
+vtu have no place: LagrangeBench's reader takes positions and types, and a force there is a function of place alone in the code of a data set.
+
+Decision: what has no place is left out and named (``Exported.left_out``, ``source`` of ``metadata.json``, a line of the command), not
+refused: the motion is as true without it, for viewers and for learners that are to do without.
 
 Decision: the folder is made under a temporary name and renamed at the end, so that an export is complete or absent. Trajectories
 pass one by one; memory is a few times the largest.
@@ -28,7 +35,7 @@ import pickle
 import shutil
 import struct
 import zipfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -58,10 +65,12 @@ _BLOCK = 2**18
 
 @dataclass
 class Exported:
-    """What an export holds: trajectories by split ("" for a lone shard), and (split, index, status) of the failed ones it leaves out."""
+    """What an export holds: trajectories by split ("" for a lone shard), and what it leaves out: (split, index, status) of the failed ones,
+    and the parts of the context that the format has no place for."""
 
     trajectories: dict[str, int] = field(default_factory=dict)
     failed: list[tuple[str, int, str]] = field(default_factory=list)
+    left_out: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -99,7 +108,7 @@ def export(
     found = _source(Path(source), split)
     if not viewer and found.content is None:
         raise InputError(source, "source", str(source), f"{format} needs a data set folder, with the statistics of its training split")
-    exported = _survey(found, index, chosen)
+    exported = _survey(found, format, index, chosen)
     # Everything that can be wrong with the request is found before anything is written.
     metadata = None if viewer else _metadata(found, format, exported)
     try:
@@ -183,8 +192,8 @@ def _trajectories(source: _Source, index: int | None = None, split: str | None =
                         yield name, reader, number
 
 
-def _survey(source: _Source, index: int | None, chosen: slice) -> Exported:
-    """Count what will be exported and list what failed; raises ``InputError`` where a split or a selection of frames would be empty."""
+def _survey(source: _Source, format: str, index: int | None, chosen: slice) -> Exported:
+    """Count what will be exported and list what will not; raises ``InputError`` where a split or a selection of frames would be empty."""
     exported = Exported(dict.fromkeys(source.shards, 0))
     for name, shards in source.shards.items():
         if source.content is not None:
@@ -197,6 +206,8 @@ def _survey(source: _Source, index: int | None, chosen: slice) -> Exported:
                         exported.failed.append((name, number, status))
                     elif index in (None, number):
                         exported.trajectories[name] += 1
+                        context = _context(reader, number)
+                        exported.left_out += [part for part in context if part not in exported.left_out and not _carries(format, context, part)]
                         if not range(frames)[chosen]:
                             raise InputError(path, f"{number:06d}/frames", frames, "the selection of frames is empty; give another --frames")
     if index is not None:
@@ -215,6 +226,40 @@ def _survey(source: _Source, index: int | None, chosen: slice) -> Exported:
     return exported
 
 
+# --- context ---------------------------------------------------------------------------------------------------------
+
+#: What a context holds beside the material numbers: of a shaken box; of a scene that does not say what its context is.
+_ACCELERATION, _UNKNOWN = "container_acceleration", "context"
+
+
+def _context(reader: ShardReader, number: int) -> dict[str, np.ndarray]:
+    """A trajectory's context by what it is, [frames, columns] float32: the container's acceleration, material numbers as their scene names them."""
+    context = reader.context(number)
+    if context is None:
+        return {}
+    (frames, _, dim), scene = reader.shape(number), reader.meta(number)["scene"]
+    if context.ndim != 2 or len(context) != frames:
+        raise InputError(reader.path, f"{number:06d}/context", context.shape, "must be [frames, c]; generate the shard again")
+    scene = scene if isinstance(scene, dict) else {}
+    columns = {_ACCELERATION: dim} if scene.get("container") else {}
+    columns |= dict.fromkeys(scene.get("context") or [], 1)
+    if sum(columns.values()) != context.shape[1]:
+        columns = {_UNKNOWN: context.shape[1]}
+    ends = np.cumsum(list(columns.values()))
+    return {name: context[:, end - width : end] for (name, width), end in zip(columns.items(), ends, strict=True)}
+
+
+def _carries(format: str, context: Collection[str], part: str) -> bool:
+    """Whether a format has a place for this part of a context."""
+    return format in ("vtkhdf", "deepmind") or (format == "geoelements" and part == _material_number(context))
+
+
+def _material_number(context: Collection[str]) -> str | None:
+    """The only material number of a context, if it has just one."""
+    numbers = [name for name in context if name not in (_ACCELERATION, _UNKNOWN)]
+    return numbers[0] if len(numbers) == 1 else None
+
+
 # --- viewers ---------------------------------------------------------------------------------------------------------
 
 
@@ -225,7 +270,7 @@ def _write_for_viewers(stem: Path, format: str, reader: ShardReader, number: int
     frames = range(len(position))[chosen]
     if format == "vtkhdf":
         stem.parent.mkdir(exist_ok=True)
-        _write_vtkhdf(stem.with_name(f"{stem.name}.vtkhdf"), position, kinds, step, frames)
+        _write_vtkhdf(stem.with_name(f"{stem.name}.vtkhdf"), position, kinds, _context(reader, number), step, frames)
     else:
         stem.mkdir(parents=True)
         _write_frames(stem, format, position, kinds, step, frames)
@@ -244,8 +289,10 @@ def velocities(position: np.ndarray, frames: Sequence[int], frame_step: float) -
     return ((position[later].astype(np.float64) - position[later - 1]) / frame_step).astype(np.float32)
 
 
-def _write_vtkhdf(path: Path, position: np.ndarray, kinds: np.ndarray, frame_step: float, frames: range) -> None:
-    """A transient PolyData of vertices: points and velocities of all steps one after another, all else once.
+def _write_vtkhdf(
+    path: Path, position: np.ndarray, kinds: np.ndarray, context: dict[str, np.ndarray], frame_step: float, frames: range
+) -> None:
+    """A transient PolyData of vertices: points and velocities of all steps one after another, all else once. The context is field data.
 
     Offsets say where a step begins in each array (VTKHDF 2.0, "Temporal data"); zero where steps share it. They share even the one
     part: VTK 9.3 (ParaView 5.12) cannot read vertices that several parts share.
@@ -268,6 +315,9 @@ def _write_vtkhdf(path: Path, position: np.ndarray, kinds: np.ndarray, frame_ste
             "Steps/PointOffsets": moving, "Steps/PointDataOffsets/velocity": moving, "Steps/PointDataOffsets/particle_type": shared,
             "Steps/CellOffsets": np.zeros((count, 4), np.int64), "Steps/ConnectivityIdOffsets": np.zeros((count, 4), np.int64),
         }
+        for name, rows in context.items():
+            rows = _in_space(rows) if name == _ACCELERATION else rows
+            arrays |= {f"FieldData/{name}": rows[np.asarray(frames)], f"Steps/FieldDataOffsets/{name}": np.arange(count)}
         for name, array in arrays.items():
             # Not ``root[name] = array``: HDF5 would write the time of day into groups on the way.
             root.create_dataset(name, data=array)
@@ -299,14 +349,14 @@ def _write_frames(folder: Path, format: str, position: np.ndarray, kinds: np.nda
 
 @dataclass(frozen=True)
 class _Split:
-    """The trajectories of one split, read from disk one by one: (position [frames, particles, dim] f32, types [particles], context or None)."""
+    """The trajectories of one split, read from disk one by one: (position [frames, particles, dim] f32, types [particles], context)."""
 
     source: _Source
     name: str
 
-    def __iter__(self) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray | None]]:
+    def __iter__(self) -> Iterator[tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]]:
         for _, reader, number in _trajectories(self.source, split=self.name):
-            yield reader.positions(number), reader.particle_type(number), reader.context(number)
+            yield reader.positions(number), reader.particle_type(number), _context(reader, number)
 
 
 def _metadata(source: _Source, format: str, exported: Exported) -> dict:
@@ -335,6 +385,7 @@ def _metadata(source: _Source, format: str, exported: Exported) -> dict:
             "generator": f"sluice {__version__}", "scene": source.content["scene"], "seed": source.content["seed"],
             "trajectories": exported.trajectories,
             "failed": {name: [number for split, number, _ in exported.failed if split == name] for name in source.shards},
+            "left_out": exported.left_out,
         },
     }
     statistics = source.content.get("statistics")
@@ -351,6 +402,10 @@ def _metadata(source: _Source, format: str, exported: Exported) -> dict:
                 remedy = f"must be {size} finite numbers; generate the data set again"
                 raise InputError(source.path / "dataset.json", f"statistics.{long}_{moment}", value, remedy)
             metadata[f"{short}_{moment}"] = value
+    if first.get("material_property") is not None:
+        # Inputs of its network: five velocities, distances to the walls, embedded type, material number; an edge's vector and length.
+        metadata |= {"nnode_in": 7 * first["dim"] + 17, "nedge_in": first["dim"] + 1}
+        metadata["source"]["material_property"] = first["material_property"]
     if format == "lagrangebench":
         counts = exported.trajectories
         metadata |= {
@@ -373,10 +428,9 @@ def _common(reader: ShardReader, number: int, format: str) -> dict:
     if format == "deepmind":
         if 4 * frames * particles * dim > _MESSAGE_LIMIT:
             raise InputError(reader.path, f"{number:06d}/position", (frames, particles, dim), "its records are below 2 GiB; give another format")
-        context = reader.context(number)
-        if context is not None and (context.ndim != 2 or len(context) != frames):
-            raise InputError(reader.path, f"{number:06d}/context", context.shape, "must be [frames, c]; generate the shard again")
-        values["context"] = None if context is None else context.shape[1]
+        values["context"] = sum(part.shape[1] for part in _context(reader, number).values()) or None
+    if format == "geoelements":
+        values["material_property"] = _material_number(_context(reader, number))
     if format == "lagrangebench":
         spacing = meta["scene"].get("spacing") if isinstance(meta["scene"], dict) else None
         if not isinstance(spacing, int | float) or not spacing > 0:
@@ -388,17 +442,24 @@ def _common(reader: ShardReader, number: int, format: str) -> dict:
 def _write_npz(path: Path, trajectories: _Split) -> None:
     """An archive of one object array (positions [T, N, d] float32, types [N] int64) a trajectory: the entries of ``np.savez``.
 
-    The format has particle counts that vary and therefore pickles. These name ``numpy.ndarray`` and ``numpy.dtype`` only, where
-    NumPy 2 by itself would name a private module that NumPy 1 lacks. The format has no place for a context.
+    A lone material number of the context is a third, [N] float32. Its reader feeds it to the network as it is; a friction angle is
+    therefore given as its tangent, as that project gives it. The format has particle counts that vary and therefore pickles. These name
+    ``numpy.ndarray`` and ``numpy.dtype`` only, where NumPy 2 by itself would name a private module that NumPy 1 lacks.
     """
     with zipfile.ZipFile(path, "w") as archive:
-        for number, (position, kinds, _) in enumerate(trajectories):
-            pair = np.empty(2, object)
-            pair[0], pair[1] = position, kinds.astype(np.int64)
+        for number, (position, kinds, context) in enumerate(trajectories):
+            arrays = [position, kinds.astype(np.int64)]
+            if (name := _material_number(context)) is not None:
+                value = context[name][0, 0]
+                value = np.tan(np.radians(value)) if name.endswith(".friction_angle") else value
+                arrays.append(np.full(len(kinds), value, np.float32))
+            entries = np.empty(len(arrays), object)
+            for slot, array in enumerate(arrays):
+                entries[slot] = array
             # ZipInfo without a date: the same bytes each time.
             with archive.open(zipfile.ZipInfo(f"simulation_{number}.npy"), "w", force_zip64=True) as entry:
-                np.lib.format.write_array_header_1_0(entry, {"descr": "|O", "fortran_order": False, "shape": (2,)})
-                _ArrayPickler(entry, protocol=4).dump(pair)
+                np.lib.format.write_array_header_1_0(entry, {"descr": "|O", "fortran_order": False, "shape": entries.shape})
+                _ArrayPickler(entry, protocol=4).dump(entries)
 
 
 class _ArrayPickler(pickle.Pickler):
@@ -417,7 +478,7 @@ def _write_tfrecord(path: Path, trajectories: _Split) -> None:
     with path.open("wb") as file:
         for number, (position, kinds, context) in enumerate(trajectories):
             features = {"key": _field(3, _field(1, _varint(number))), "particle_type": _bytes_feature(kinds.astype("<i8"))}
-            lists = {"position": position} | ({} if context is None else {"step_context": context})
+            lists = {"position": position} | ({"step_context": np.concatenate([*context.values()], axis=1)} if context else {})
             lists = {name: b"".join(_field(1, _bytes_feature(frame.astype("<f4"))) for frame in frames) for name, frames in lists.items()}
             message = _field(1, _map(features)) + _field(2, _map(lists))
             length = struct.pack("<Q", len(message))

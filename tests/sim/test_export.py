@@ -107,9 +107,12 @@ def hidden(folder):
 
 
 def read_geoelements(folder, split):
-    """As ``load_npz_data`` of geoelements/gns does it."""
+    """As ``load_npz_data`` and ``TrajectoriesDataset`` of geoelements/gns do it: [(positions, types)], or [(positions, types, material property)]."""
     with np.load(folder / f"{split}.npz", allow_pickle=True) as file:
-        return [(position, kinds) for position, kinds in (item for _, item in file.items())]
+        data = [item for _, item in file.items()]
+    if len(data[0]) >= 3:
+        return [(position, kinds, np.full(position.shape[1], number, dtype=float)) for position, kinds, number in data]
+    return [(position, kinds) for position, kinds in data]
 
 
 def read_deepmind(folder, split):
@@ -299,6 +302,66 @@ def test_context_of_every_step_goes_to_deepmind(tmp_path):
     assert metadata["context_mean"] == [6.0]
     assert metadata["context_std"] == pytest.approx([np.sqrt(35 / 3)])  # of 1, 3, 5, 7, 9, 11
     same_bits(read_deepmind(tmp_path / "out", "test")[0][2], 100 * context)
+
+
+CONTEXT = np.array([[1, 2, 45], [3, 4, 45], [5, 6, 45]], np.float32)
+SHAKEN = {"name": "made up", "spacing": 0.05, "container": {"kind": "made up"}, "context": ["sand.friction_angle"]}
+
+
+def shaken(scene, *columns):
+    return {"context": CONTEXT[:, columns], "scene": SHAKEN | scene}
+
+
+#: What a scene is told and what each format leaves of it; all others have it all.
+CONTEXTS = {
+    "acceleration": (shaken({"context": []}, 0, 1), ["container_acceleration"], ["container_acceleration"]),
+    "number": (shaken({"container": None}, 2), [], ["sand.friction_angle"]),
+    "both": (shaken({}, 0, 1, 2), ["container_acceleration"], ["container_acceleration", "sand.friction_angle"]),
+    "two numbers": (shaken({"container": None, "context": ["a.b", "c.d"]}, 0, 1), ["a.b", "c.d"], ["a.b", "c.d"]),
+    "not said": (shaken({}, 0), ["context"], ["context"]),
+}
+
+
+@pytest.mark.parametrize("case", CONTEXTS)
+def test_context_that_has_no_place_is_named(tmp_path, case):
+    changes, geoelements, others = CONTEXTS[case]
+    data = write_data(tmp_path / "data", {"train": {0: some(0, 3, **changes), 1: some(1, 3)}})
+    with ShardReader(data / "train/shard-00000.h5") as reader:
+        assert reader.context(1) is None, "one that has it is enough"
+    wanted = dict.fromkeys(FORMATS, others) | {"geoelements": geoelements, "vtkhdf": [], "deepmind": []}
+    for name in VIEWER_FORMATS + ("lagrangebench",):
+        assert export(data, tmp_path / name, name).left_out == wanted[name]
+    data = write_data(tmp_path / "same", {"train": {0: some(0, 3, **changes)}})
+    for name in LEARNER_FORMATS:
+        assert export(data, tmp_path / "learners" / name, name).left_out == wanted[name]
+        source = json.loads((tmp_path / "learners" / name / "metadata.json").read_text())["source"]
+        assert source["left_out"] == wanted[name]
+
+
+def test_a_material_number_goes_to_geoelements(tmp_path):
+    """A friction angle of 45 degrees is 1; inputs of the network: 5 x 2 velocities, 4 walls, 16 of the type, 1 number; an edge's 2 + 1."""
+    train, test = some(0, 3, **shaken({}, 0, 1, 2)), some(1, 3, **shaken({"context": ["sand.density"]}, 0, 1, 2))
+    export(write_data(tmp_path / "data", {"train": {0: train}}), tmp_path / "out", "geoelements")
+    assert read_geoelements(tmp_path / "out", "train")[0][2] == pytest.approx(np.ones(train.position.shape[1]))
+    metadata = json.loads((tmp_path / "out/metadata.json").read_text())
+    assert (metadata["nnode_in"], metadata["nedge_in"], metadata["source"]["material_property"]) == (31, 3, "sand.friction_angle")
+    export(write_data(tmp_path / "plain", {"train": {0: test}}), tmp_path / "as it is", "geoelements")
+    assert (read_geoelements(tmp_path / "as it is", "train")[0][2] == 45).all()
+    with pytest.raises(InputError, match="material_property = 'sand.density': the first trajectory has sand.friction_angle"):
+        export(write_data(tmp_path / "mixed", {"train": {0: train}, "test": {0: test}}), tmp_path / "none", "geoelements")
+
+
+@pytest.mark.parametrize(("frames", "wanted"), [("::2", [0, 2]), ("1", [1])])
+def test_context_is_field_data_in_paraview(tmp_path, frames, wanted):
+    export(write_data(tmp_path / "data", {"train": {0: some(0, 3, **shaken({}, 0, 1, 2))}}), tmp_path / "out", "vtkhdf", frames=frames)
+    reader = vtkHDFReader()
+    reader.SetFileName(str(tmp_path / "out/train/000000.vtkhdf"))
+    reader.UpdateInformation()
+    for frame in reversed(wanted):
+        reader.UpdateTimeStep(frame * 0.0025)
+        found = reader.GetOutputDataObject(0).GetFieldData()
+        assert vtk_to_numpy(found.GetArray("container_acceleration")).tolist() == [[*CONTEXT[frame, :2].tolist(), 0.0]]
+        assert vtk_to_numpy(found.GetArray("sand.friction_angle")).tolist() == [45.0]
 
 
 def test_crc32c_by_published_vectors():
@@ -581,6 +644,18 @@ def test_command(data, tmp_path, capsys):
     shard = str(data / "test/shard-00000.h5")
     assert main(["export", shard, "--format", "ply", "--frames=-1", "--index", "0", "--out", str(tmp_path / "last")]) == 0
     assert [path.name for path in (tmp_path / "last/000000").iterdir()] == ["frame-00007.ply"]
+
+
+def test_command_says_what_has_no_place(tmp_path, capsys):
+    data = write_data(tmp_path / "data", {"train": {0: some(0, 3, **shaken({}, 0, 1, 2))}})
+    for name, line in {
+        "geoelements": "context = container_acceleration: left out, geoelements has no place for it; deepmind has",
+        "ply": "context = container_acceleration, sand.friction_angle: left out, ply has no place for it; vtkhdf has",
+    }.items():
+        assert main(["export", str(data), "--format", name, "--out", str(tmp_path / name)]) == 0
+        assert capsys.readouterr().err == f"sluice-sim: {tmp_path / name}: {line}\n"
+    assert main(["export", str(data), "--format", "vtkhdf", "--out", str(tmp_path / "all")]) == 0
+    assert capsys.readouterr().err == ""
 
 
 def test_command_knows_the_formats(capsys):
