@@ -65,10 +65,10 @@ def run(resolution: int) -> Outcome:
     As long as a plateau stands, a column knows no length but H0, and its run-out is a multiple of it: low columns are resolved along H0, so that
     those of 1.5 and 2, without a plateau, are what is compared. Resolved along L0, as tall ones are, they would be a few cells high.
 
-    Of tall columns the law is a mean: between plane walls the run-out bends, here from a slope of 0.8 at a = 5 to 0.6 at 16. So the fit goes up
-    to a = 20, as far as the experiments. Those are in channels, whose side walls count: Balmforth & Kerswell 2005 measured a^(0.9 +- 0.1) in wide
-    ones, a^(0.65 +- 0.05) in narrow ones. Constant friction is enough for the law (as in Rousseau et al. 2023, up to a of about 10): with mu(I)
-    instead, tall columns ran a quarter less far, all alike, and 8 cells along L0 gave the exponent 0.76 as before.
+    Of tall columns the law is a mean: in two dimensions the run-out bends, here from a slope of 0.8 at a = 5 to 0.6 at 16. So the fit goes up to
+    a = 20; to 12 alone it would be 0.77. Experiments are in channels, whose side walls count: Balmforth & Kerswell 2005 measured
+    a^(0.9 +- 0.1) in wide ones, a^(0.65 +- 0.05) in narrow ones. Constant friction is enough for the law (as in Rousseau et al. 2023, up to a of
+    about 10): with mu(I) instead, tall columns ran a quarter less far, all alike, and 8 cells along L0 gave the exponent 0.76 as before.
 
     Three things had to be so:
 
