@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from sim.validation import CASES, Curve, Outcome
+from sim.validation.granular_collapse import packed
 from sim.validation.ladder import main, module, order, page
 
 #: Cases that hold, each at the least resolution that is worth its time. Those that do not hold yet are in docs/validation.md.
 AFFORDABLE = {
     "rotation": 32, "return_map": 1000, "hydrostatics": 32, "elastic_column": 16, "axial_bar": 4, "cantilever": 4, "standing_wave": 32,
-    "dam_break": 16, "block_on_plane": 32, "elastic_discs": 40, "viscoplastic_slump": 80,
+    "dam_break": 16, "granular_collapse": 8, "block_on_plane": 32, "elastic_discs": 40, "viscoplastic_slump": 80,
 }
 
 
@@ -24,6 +26,25 @@ def test_case(case):
         assert len(curve.x) == len(curve.ours) == len(curve.reference), name
         assert np.isfinite(curve.ours).all(), name
         assert curve.passed, f"{name}: {curve.label}: {curve.error:.4g}, tolerance {curve.tolerance:.4g}"
+
+
+@pytest.mark.parametrize("squeeze", [1.0, 0.3, 0.05])
+def test_sand_is_packed_evenly_however_far_it_is_stretched(squeeze):
+    """No two particles nearer than two thirds of their mean spacing, no place farther from one than a spacing; a plain lattice of the
+    column parts into rows."""
+    at, spacing = packed(2000, 1.0, 20.0), 0.1
+
+    def gaps(particles):
+        particles = particles * [1 / squeeze, squeeze]
+        inside = np.stack(np.meshgrid(np.linspace(0.1, 0.9, 60) / squeeze, np.linspace(2, 18, 60) * squeeze), -1).reshape(-1, 2)
+        tree = cKDTree(particles)
+        return tree.query(particles, 2)[0][:, 1].min() / spacing, tree.query(inside)[0].max() / spacing
+
+    nearest, farthest = gaps(at)
+    assert nearest > 2 / 3 and farthest < 1 and (at > 0).all() and (at < [1, 20]).all()
+    if squeeze < 0.1:
+        rows = (np.stack(np.meshgrid(np.arange(10), np.arange(200)), -1).reshape(-1, 2) + 0.5) * spacing
+        assert gaps(rows)[0] < 0.1 and gaps(rows)[1] > 5
 
 
 def outcomes(case, *errors):
