@@ -238,8 +238,8 @@ def _memory(material: str, dim: int, size: tuple, frames: int) -> dict:
     grid = int(np.multiply(*planned["fields"]["grid"]))
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 - before
     return {"case": f"memory, {scene.name}", "particles": count, "grid_bytes": grid, "planned_bytes_a_particle": (planned["bytes"] - grid) / count,
-            "resident_bytes_a_particle": (grown - grid) / count, "peak_bytes_a_particle": (peak - grid) / count, "load_seconds": loaded, "frames": frames, "substeps": sum(substeps),
-            "taichi_mps": count * sum(substeps) / spent / 1e6}  # fmt: skip
+            "resident_bytes_a_particle": (grown - grid) / count, "peak_bytes_a_particle": (peak - grid) / count, "load_seconds": loaded,
+            "frames": frames, "substeps": sum(substeps), "taichi_mps": count * sum(substeps) / spent / 1e6}  # fmt: skip
 
 
 def memory(material: str, dim: int, size: tuple, frames: int = 1) -> dict:

@@ -50,5 +50,6 @@ def run() -> list[Cell]:
             right = run.ok and inside and max(into) <= np.finfo(np.float32).eps * max(run.speed.max(initial=0.0), 1.0)
             observed = f"{'inside' if inside else 'outside'}, at most {max(into):.2g} m/s into a wall" if run.ok else run.status
             numbers = {"particles": len(run.position), "speed_into_wall": max(into), "fastest": float(run.speed.max(initial=0.0))}
-            cells.append(Cell("contact", f"{name}, {start}{', 3D' if dim == 3 else ''}", right, EXPECTED, observed, numbers, time.perf_counter() - begun))
+            cell = f"{name}, {start}{', 3D' if dim == 3 else ''}"
+            cells.append(Cell("contact", cell, right, EXPECTED, observed, numbers, time.perf_counter() - begun))
     return cells
