@@ -15,7 +15,9 @@ NUMBER = 16
 RESOLUTIONS = (16, 32, 64)
 WIDTH, HEIGHT, DEPTH = 0.25, 0.125, 0.5
 RATIOS = np.array([0.3, 0.5, 0.8])
-SOUND_SPEED = 15.0
+SOUND_SPEED, G = 15.0, 9.8
+#: Where a held box's faces stand between nodes [cells].
+PHASES = (0.0, 1 / 4, 1 / 3, 1 / 2, 2 / 3, 3 / 4)
 
 
 def run(resolution: int) -> Outcome:
@@ -44,7 +46,7 @@ def run(resolution: int) -> Outcome:
     return Outcome("float_and_sink", resolution, len(pool_scene(1.0, 0.1875, resolution).particles().position), curves, seconds)
 
 
-def pool_scene(ratio: float, bottom: float, cells: int = 32, sound_speed: float = SOUND_SPEED) -> Scene:
+def pool_scene(ratio: float, bottom: float, cells: int = 32, sound_speed: float = SOUND_SPEED, particles_per_cell: int = 2) -> Scene:
     """A pool 1 wide and about 0.5 deep, a box 0.25 x 0.125 of ``ratio`` times water's density in its middle, its lower face at ``bottom``.
 
     Where the box is, there is no water: the pool is made of the rectangles around it.
@@ -56,7 +58,7 @@ def pool_scene(ratio: float, bottom: float, cells: int = 32, sound_speed: float 
     bodies.append({"material": "box", "kind": "box", "lower": [left, bottom], "upper": [right, top], "velocity": [0.0, 0.0]})
     return Scene.model_validate({
         "name": "pool", "dim": 2, "bounds": [[0.0, 1.0], [0.0, 1.0]], "gravity": [0.0, -9.8], "frame_step": 0.01, "frames": 300, "radius": 0.1,
-        "cells": [cells, cells], "seed": 0, "bodies": bodies,
+        "cells": [cells, cells], "particles_per_cell": particles_per_cell, "seed": 0, "bodies": bodies,
         "materials": {"water": {"model": "water", "sound_speed": sound_speed}, "box": {"model": "rigid", "density": 1000.0 * ratio}},
     })
 
@@ -89,3 +91,31 @@ def float_and_sink(ratio: float, bottom: float, cells: int = 32, seconds: float 
     return {"reference": min(ratio, 1.0), "ours": ours, "error": abs(ours / ratio - 1), "seconds": time.perf_counter() - begun,
             "sunk": float(position[box][:, 1].min() - scene.spacing / 2),
             "drift": float(np.linalg.norm(drift))}  # fmt: skip
+
+
+def buoyancy(phase: float, cells: int = 32, simulator: MPMSimulator | None = None) -> dict:
+    """Upward force [N/m] on an immersed box that is held, its horizontal faces ``phase`` cells above nodes; a multiple of 1/2, 1/3 or 1/4, so
+    that water's lattice ends on the faces.
+
+    A frame is one substep. Before each the box is put back, with a speed that gravity takes from it: what it has after the substep is
+    water's impulse. Its density, which decides nothing else, is so high that it hardly moves. The pool, which begins unpressed, is stilled in
+    the first half second; the force is the mean over the sound's period that follows, the reference rho g V with the water's density there.
+    """
+    per_cell = next(n for n in (2, 3, 4) if abs(phase * n - round(phase * n)) < 1e-9)
+    bottom, heavy = (0.1875 * cells + phase) / cells, 100.0
+    steps = int(np.ceil(0.01 * cells * (SOUND_SPEED + 1) / 0.35))
+    scene = pool_scene(heavy, bottom, cells, particles_per_cell=per_cell)
+    scene = Scene.from_dict(scene.to_dict() | {"frame_step": 0.01 / steps, "time_step": 0.01 / steps})
+    simulator = simulator or MPMSimulator()
+    simulator.load(scene)
+    dt, held, begun, forces = scene.frame_step, simulator.rigid.motion(), time.perf_counter(), []
+    held["velocity"][0, 1] = G * dt
+    for step in range(round(0.5 / dt) + round(4 * DEPTH / SOUND_SPEED / dt)):
+        simulator.rigid.set_motion(held)
+        if step < 0.5 / dt and step % 20 == 19:
+            simulator.set_velocity(0.7 * simulator.state()["velocity"])
+        simulator.frame()
+        forces.append(1000.0 * heavy * WIDTH * HEIGHT * simulator.rigid.motion()["velocity"][0, 1] / dt)
+    reference = 1000.0 * (1 + 7 * G * (DEPTH - bottom - HEIGHT / 2) / SOUND_SPEED**2) ** (1 / 7) * G * WIDTH * HEIGHT
+    ours = float(np.mean(forces[round(0.5 / dt) :]))
+    return {"reference": reference, "ours": ours, "error": ours / reference - 1, "seconds": time.perf_counter() - begun}
