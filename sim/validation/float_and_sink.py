@@ -28,7 +28,7 @@ def run(resolution: int) -> Outcome:
     more than the water that began beside it, for the pool settles under its own weight.
 
     Buoyancy is also measured as a force, on a box that is held (``buoyancy``), at six places of its horizontal faces between nodes. It errs by
-    1 to 4 % on the coarsest grid, the box two cells high, by less than 4 % on the middle one; most where the faces are half-way.
+    1 to 4 % on the coarsest grid, the box two cells high, by less than 4 % on the middle and 2 % on the finest.
 
     A neutral box asks for far more: 5 % of its height in 3 s, with its added mass, is a net force below 5e-4 of its buoyancy, and what brings
     it back, the growth of water's density with depth, swings it at g / c, ten seconds a period. In a pool that was stilled first it stays within
