@@ -17,7 +17,7 @@ import numpy as np
 from sim.errors import InputError
 from sim.mpm.decomposition import finite
 from sim.mpm.materials import MODELS
-from sim.mpm.rigid import RigidBodies, body_table
+from sim.mpm.rigid import RigidBodies, body_table, contacts_at_most
 from sim.mpm.walls import solid, wall
 from sim.obstacles import THINNEST, combine
 from sim.scene import Particles, Scene
@@ -122,7 +122,7 @@ class _Kernels:
             ti.field(ti.f32, capacity) if isinstance(field, ti.ScalarField) else ti.Vector.field(field.n, ti.f32, capacity) for field in self.state
         ]
         self.has_rigid = structure.rigid is not None
-        self.rigid = RigidBodies(self, *structure.rigid, capacity) if self.has_rigid else None
+        self.rigid = RigidBodies(self, *structure.rigid, contacts_at_most(capacity)) if self.has_rigid else None
         if self.has_rigid:
             self.touched = ti.Vector.field(dim, ti.i32, 2)  # lowest and highest first node of a particle
         self.frame = (self.frame_rigid if self.has_rigid else self.frame_serial) if serial else self.frame_parallel
@@ -484,7 +484,7 @@ class _Kernels:
     def spread(self, dt):
         """Particles to grid; returns the lowest and highest first node of a particle."""
         low, high = ti.Vector([1 << 20] * self.dim), ti.Vector([0] * self.dim)
-        for m in ti.static(range(len(self.models))):
+        for m in ti.static(self.flowing):
             for p in range(self.range[m], self.range[m + 1]):
                 base, fx = self.locate(self.x[p])
                 low, high = ti.min(low, base), ti.max(high, base)
@@ -495,7 +495,7 @@ class _Kernels:
     def clear(self, I):
         self.grid[I] = ti.Vector.zero(ti.f32, 4)
         if ti.static(self.has_rigid):
-            self.rigid.share[I] = ti.Vector.zero(ti.f32, 2)
+            self.rigid.water[I] = ti.Vector.zero(ti.f32, self.dim + 1)
 
     @ti.func
     def collect(self, low, high, dt):
@@ -554,11 +554,12 @@ class _Kernels:
                 self.report(m, p, position, sums)
 
     def frame_rigid(self, substeps, dt, keep, position, sums) -> None:
-        """The same with rigid bodies, in five kernels a substep: all in one took 18 s to compile."""
+        """The same with rigid bodies, in six kernels a substep: all in one took 18 s to compile."""
         if keep:
             self.save(sums)
             self.keep_rigid(False)
         for _ in range(0 if sums[7] else substeps):
+            self.expel_rigid()
             self.spread_serial(dt, sums)
             self.step_rigid(dt, sums)
             self.collect_serial(dt, sums)
@@ -571,6 +572,12 @@ class _Kernels:
         ti.loop_config(serialize=True)
         for _ in range(1):
             self.touched[0], self.touched[1] = self.spread(dt)
+
+    @ti.kernel
+    def expel_rigid(self):
+        for m in ti.static(self.flowing):
+            for p in range(self.range[m], self.range[m + 1]):
+                self.rigid.expel(p, self.mass_volume[m][0])
 
     @ti.kernel
     def meet_rigid(self, dt: ti.f32):
@@ -603,12 +610,14 @@ class _Kernels:
             sums[5] = ti.max(sums[5], ti.cast(self.collect(self.touched[0], self.touched[1], dt), ti.f64))
 
     def frame_parallel(self, substeps, dt, keep, position, sums) -> None:
-        """The same, two kernels a substep (five with rigid bodies), all loops parallel (for a GPU)."""
+        """The same, two kernels a substep (six with rigid bodies), all loops parallel (for a GPU)."""
         if keep:
             self.save(sums)
             if self.has_rigid:
                 self.keep_rigid(False)
         for _ in range(0 if sums[7] else substeps):
+            if self.has_rigid:
+                self.expel_rigid()
             self.spread_parallel(dt, sums)
             if self.has_rigid:
                 self.step_rigid(dt, sums)
@@ -619,7 +628,7 @@ class _Kernels:
     def spread_parallel(self, dt: ti.f32, sums: ti.types.ndarray(ti.f64, 1)):
         if ti.static(self.structure.shaken):
             self.shake(sums)
-        for m in ti.static(range(len(self.models))):
+        for m in ti.static(self.flowing):
             for p in range(self.range[m], self.range[m + 1]):
                 base, fx = self.locate(self.x[p])
                 self.p2g(m, p, base, fx, dt)
@@ -1021,8 +1030,8 @@ class MPMSimulator:
             left_out["rigid bodies"] = "none in the scene"
         else:
             fields |= RigidBodies.sizes(dim, *structure.rigid, n, nodes)
-            kernels[2:] = ["save", "spread_serial", "meet_rigid", "solve_rigid", "move_rigid", "collect_serial", "report_parallel", "load_rigid",
-                           "keep_rigid"]
+            kernels[2:] = ["save", "expel_rigid", "spread_serial", "meet_rigid", "solve_rigid", "move_rigid", "collect_serial", "report_parallel",
+                           "load_rigid", "keep_rigid"]
         gravity = float(np.linalg.norm(np.array(scene.gravity) - scene.acceleration(), axis=1).max())
         start = float(np.sqrt((particles.velocity**2).sum(1).max()))
         fall = float(np.sqrt(start**2 + 2 * gravity * np.linalg.norm(upper - lower)))
@@ -1130,6 +1139,11 @@ class MPMSimulator:
         lanes[:n, :dim], lanes[:n, dim] = velocity, 1.0
         kernels.v.from_numpy(lanes)
         self._run(0, 0.0, keep=True)
+
+    @property
+    def rigid(self) -> RigidBodies:
+        """The rigid bodies of the loaded scene, in the order of its bodies."""
+        return self._kernels.rigid
 
     def inject(self, name: str, particle: int, value) -> None:
         """Overwrite what ``state`` gives for one particle under a name (a material's: counted within it), positions in cells. For studies of
