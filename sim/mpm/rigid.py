@@ -17,8 +17,8 @@ at the point, a half-space of water having exactly a half there, closed in 1 / `
 the space water's, it is not seen. Drops weigh too little to be a contact; they and what slips through between points are put back on the
 face, inelastically, before every substep (``expel``).
 
-The moment of inertia of a lone body is I = sum_p m (|r|^2 1 - r r^T) and that of the quadratic B-splines, dx^2 / 4 along each axis. Two and
-three dimensions share the code: a 2D body is a 3D one that turns about z.
+The moment of inertia is I = sum_p m (|r|^2 1 - r r^T) and that of the particles as cubes of edge h, h^2 / 12 along each axis: exact for a box.
+Two and three dimensions share the code: a 2D body is a 3D one that turns about z.
 
 Walls and obstacles act on the *body* too. Contacts are points: a particle, a ball half a spacing thick, against a wall, a signed distance or
 the faces of another body, u.n >= -gap / dt (inelastic; no approach beyond the gap), |J_t| <= mu J_n, solved with those of the grid by projected
@@ -476,11 +476,14 @@ class RigidBodies:
 
     @ti.func
     def move(self, b, dt):
-        """c += V dt; rotation by spin dt; the angular momentum, not the spin, stays as the inertia turns with the body."""
+        """c += V dt; the angular momentum, not the spin, stays as the inertia turns with the body, which turns by the spin at the middle of the
+        substep. By that at its start a tumbling brick gained 4 % of its energy in two turns of 100 steps.
+        """
         self.centre[b] += dt / self.kernels.dx[None] * self.velocity[b]
         R = rotation(self.turn[b])
         L = R @ (self.inertia[b] @ (R.transpose() @ self.spin[b]))
-        q = turned(self.turn[b], dt * self.spin[b])
+        M = rotation(turned(self.turn[b], 0.5 * dt * self.spin[b]))
+        q = turned(self.turn[b], dt * (M @ (self.rest_inverse[b] @ (M.transpose() @ L))))
         self.turn[b] = q
         self.refresh(b)
         self.spin[b] = self.inverse[b] @ L
@@ -550,7 +553,7 @@ def body_table(scene: Scene, particles, cell: np.ndarray, dx: float, wall: int, 
         centre[:dim] = cell[members].mean(0)
         arm = np.zeros((len(members), 3))
         arm[:, :dim] = cell[members] - centre[:dim]
-        second = mass * (arm.T @ arm + len(members) * np.diag([0.25] * dim + [0.0] * (3 - dim)))
+        second = mass * (arm.T @ arm + len(members) * np.diag([(particles.spacing / dx) ** 2 / 12] * dim + [0.0] * (3 - dim)))
         faces = np.zeros((0, dim + 1))
         if body.kind == "polygon":
             faces = ConvexHull(body.vertices).equations

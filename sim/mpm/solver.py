@@ -467,9 +467,9 @@ class _Kernels:
             speed2 += self.v[p][d] ** 2
             height -= self.gravity[None][d] * x
         if ti.static(self.models[m][0] == "rigid"):
-            # A body's inertia includes the splines' own moments; its energy does too.
+            # The particle turns as a cube of the body: h^2 / 12 = half^2 / 3.
             for a in ti.static(range(self.dim)):
-                speed2 += 0.25 * (self.dx[None] * self.C[a][p]).norm_sqr()
+                speed2 += self.rigid.half[None] ** 2 / 3.0 * (self.dx[None] * self.C[a][p]).norm_sqr()
         sums[0] += ti.cast(0.5 * mass * speed2, ti.f64)
         sums[1] += ti.cast(mass * height, ti.f64)
         sums[2] += ti.cast(volume * self.materials[m].energy_density(p), ti.f64)
