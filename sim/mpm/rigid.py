@@ -35,7 +35,7 @@ from sim.scene import Scene
 from sim.taichi_runtime import ti
 
 #: Sweeps of the contact solver at most, and the change of an impulse, relative to the largest, at which it is done.
-SWEEPS, SETTLED = 60, 1e-4
+SWEEPS, SETTLED = 60, 1e-3
 #: Contacts are listed from this gap on [cells], in addition to a substep's way.
 NEAR = 0.1
 #: Distance from a wall, in cells, at which particles are stopped.
