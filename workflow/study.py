@@ -29,7 +29,7 @@ SCHEMA = ROOT / "workflow" / "schemas" / "study.schema.json"
 #: The two parts of a data set. They are made by jobs of their own, so that more test trajectories do not mean another training.
 PARTS = {"learning": ("train", "valid"), "test": ("test",)}
 FIGURES = ("error_over_run_time", "error_over_time", "kinetic_energy")
-_RUNG_KEYS = ("cfl", "stiffness", "coarsen", "particles")
+_RUNG_KEYS = ("cfl", "stiffness", "coarsen", "particles", "frames")
 
 
 def _explain(error: ValidationError, path: Path) -> InputError:

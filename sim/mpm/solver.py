@@ -450,35 +450,35 @@ class _Kernels:
                         self.grid[node - i * step] = v0 + float(i) * slope
 
     @ti.func
-    def shake(self, sums: ti.template()):
-        """What bodies feel in a box of acceleration a is gravity - a; a stands behind the ``SUMS``."""
+    def shake(self, f, sums: ti.template()):
+        """What bodies feel in a box of acceleration a is gravity - a; a stands behind the ``SUMS`` of frame f."""
         for _ in range(1):
             for d in ti.static(range(self.dim)):
-                self.pull[None][d] = self.gravity[None][d] - ti.cast(sums[SUMS + d], ti.f32)
+                self.pull[None][d] = self.gravity[None][d] - ti.cast(sums[f, SUMS + d], ti.f32)
 
     @ti.func
-    def report(self, m: ti.template(), p, position: ti.template(), sums: ti.template()):
-        """Position of one particle [length], and its part in the sums (see ``SUMS``)."""
+    def report(self, m: ti.template(), p, f, position: ti.template(), sums: ti.template()):
+        """Position of one particle [length] at the end of frame f, and its part in the frame's sums (see ``SUMS``)."""
         mass, volume = self.mass_volume[m][0], self.mass_volume[m][1]
         speed2, height = 0.0, 0.0
         for d in ti.static(range(self.dim)):
             x = self.lower[None][d] + (self.x[p][d] - WALL) * self.dx[None]
-            position[p, d] = x
+            position[f, p, d] = x
             speed2 += self.v[p][d] ** 2
             height -= self.gravity[None][d] * x
         if ti.static(self.models[m][0] == "rigid"):
             # The particle turns as a cube of the body: h^2 / 12 = half^2 / 3.
             for a in ti.static(range(self.dim)):
                 speed2 += self.rigid.half[None] ** 2 / 3.0 * (self.dx[None] * self.C[a][p]).norm_sqr()
-        sums[0] += ti.cast(0.5 * mass * speed2, ti.f64)
-        sums[1] += ti.cast(mass * height, ti.f64)
-        sums[2] += ti.cast(volume * self.materials[m].energy_density(p), ti.f64)
-        ti.atomic_max(sums[3], ti.cast(speed2, ti.f64))
-        ti.atomic_max(sums[4], ti.cast(self.materials[m].wave_speed(p), ti.f64))
+        sums[f, 0] += ti.cast(0.5 * mass * speed2, ti.f64)
+        sums[f, 1] += ti.cast(mass * height, ti.f64)
+        sums[f, 2] += ti.cast(volume * self.materials[m].energy_density(p), ti.f64)
+        ti.atomic_max(sums[f, 3], ti.cast(speed2, ti.f64))
+        ti.atomic_max(sums[f, 4], ti.cast(self.materials[m].wave_speed(p), ti.f64))
         broken = not (finite(self.x[p].sum() + speed2) and self.materials[m].intact(p))
         for a in ti.static(range(self.dim)):
             broken = broken or not finite(self.C[a][p].sum())
-        sums[6] += ti.cast(broken, ti.f64)
+        sums[f, 6] += ti.cast(broken, ti.f64)
 
     @ti.func
     def spread(self, dt):
@@ -536,39 +536,41 @@ class _Kernels:
 
     @ti.kernel
     def frame_serial(
-        self, substeps: ti.i32, dt: ti.f32, keep: ti.i32, position: ti.types.ndarray(ti.f32, 2), sums: ti.types.ndarray(ti.f64, 1)
+        self, frames: ti.i32, substeps: ti.i32, dt: ti.f32, keep: ti.i32, position: ti.types.ndarray(ti.f32, 3), sums: ti.types.ndarray(ti.f64, 2)
     ):
-        """A whole frame; ``keep`` saves the state first. Only the box of nodes that particles touch is swept."""
-        if ti.static(self.structure.shaken):
-            self.shake(sums)
+        """Whole frames; ``keep`` saves the state first. Only the box of nodes that particles touch is swept."""
         ti.loop_config(serialize=True)
         for p in range(keep * self.range[ti.static(len(self.models))]):
             self.save_particle(p, sums)
         ti.loop_config(serialize=True)
-        for _ in range(ti.select(sums[7] > 0.0, 0, substeps)):
-            low, high = self.spread(dt)
-            sums[5] = ti.max(sums[5], ti.cast(self.collect(low, high, dt), ti.f64))
-        for m in ti.static(range(len(self.models))):
-            ti.loop_config(serialize=True)
-            for p in range(self.range[m], self.range[m + 1]):
-                self.report(m, p, position, sums)
+        for f in range(ti.select(sums[0, 7] > 0.0, 0, frames)):
+            if ti.static(self.structure.shaken):
+                self.shake(f, sums)
+            for _ in range(substeps):
+                low, high = self.spread(dt)
+                sums[f, 5] = ti.max(sums[f, 5], ti.cast(self.collect(low, high, dt), ti.f64))
+            for m in ti.static(range(len(self.models))):
+                for p in range(self.range[m], self.range[m + 1]):
+                    self.report(m, p, f, position, sums)
 
-    def frame_rigid(self, substeps, dt, keep, position, sums) -> None:
+    def frame_rigid(self, frames, substeps, dt, keep, position, sums) -> None:
         """The same with rigid bodies, in six kernels a substep: all in one took 18 s to compile."""
         if keep:
             self.save(sums)
             self.keep_rigid(False)
-        for _ in range(0 if sums[7] else substeps):
-            self.expel_rigid()
-            self.spread_serial(dt, sums)
-            self.step_rigid(dt, sums)
-            self.collect_serial(dt, sums)
-        self.report_parallel(position, sums)
+        for f in range(0 if sums[0, 7] else frames):
+            row = sums[f : f + 1]
+            for _ in range(substeps):
+                self.expel_rigid()
+                self.spread_serial(dt, row)
+                self.step_rigid(dt, row)
+                self.collect_serial(dt, row)
+            self.report_parallel(position[f : f + 1], row)
 
     @ti.kernel
-    def spread_serial(self, dt: ti.f32, sums: ti.types.ndarray(ti.f64, 1)):
+    def spread_serial(self, dt: ti.f32, sums: ti.types.ndarray(ti.f64, 2)):
         if ti.static(self.structure.shaken):
-            self.shake(sums)
+            self.shake(0, sums)
         ti.loop_config(serialize=True)
         for _ in range(1):
             self.touched[0], self.touched[1] = self.spread(dt)
@@ -593,10 +595,10 @@ class _Kernels:
             self.rigid.solve()
 
     @ti.kernel
-    def move_rigid(self, dt: ti.f32, sums: ti.types.ndarray(ti.f64, 1)):
+    def move_rigid(self, dt: ti.f32, sums: ti.types.ndarray(ti.f64, 2)):
         ti.loop_config(serialize=True)
         for _ in range(1):
-            sums[5] = ti.max(sums[5], ti.cast(self.rigid.advance(dt), ti.f64))
+            sums[0, 5] = ti.max(sums[0, 5], ti.cast(self.rigid.advance(dt), ti.f64))
 
     def step_rigid(self, dt, sums) -> None:
         self.meet_rigid(dt)
@@ -604,37 +606,39 @@ class _Kernels:
         self.move_rigid(dt, sums)
 
     @ti.kernel
-    def collect_serial(self, dt: ti.f32, sums: ti.types.ndarray(ti.f64, 1)):
+    def collect_serial(self, dt: ti.f32, sums: ti.types.ndarray(ti.f64, 2)):
         ti.loop_config(serialize=True)
         for _ in range(1):
-            sums[5] = ti.max(sums[5], ti.cast(self.collect(self.touched[0], self.touched[1], dt), ti.f64))
+            sums[0, 5] = ti.max(sums[0, 5], ti.cast(self.collect(self.touched[0], self.touched[1], dt), ti.f64))
 
-    def frame_parallel(self, substeps, dt, keep, position, sums) -> None:
+    def frame_parallel(self, frames, substeps, dt, keep, position, sums) -> None:
         """The same, two kernels a substep (six with rigid bodies), all loops parallel (for a GPU)."""
         if keep:
             self.save(sums)
             if self.has_rigid:
                 self.keep_rigid(False)
-        for _ in range(0 if sums[7] else substeps):
-            if self.has_rigid:
-                self.expel_rigid()
-            self.spread_parallel(dt, sums)
-            if self.has_rigid:
-                self.step_rigid(dt, sums)
-            self.collect_parallel(dt, sums)
-        self.report_parallel(position, sums)
+        for f in range(0 if sums[0, 7] else frames):
+            row = sums[f : f + 1]
+            for _ in range(substeps):
+                if self.has_rigid:
+                    self.expel_rigid()
+                self.spread_parallel(dt, row)
+                if self.has_rigid:
+                    self.step_rigid(dt, row)
+                self.collect_parallel(dt, row)
+            self.report_parallel(position[f : f + 1], row)
 
     @ti.kernel
-    def spread_parallel(self, dt: ti.f32, sums: ti.types.ndarray(ti.f64, 1)):
+    def spread_parallel(self, dt: ti.f32, sums: ti.types.ndarray(ti.f64, 2)):
         if ti.static(self.structure.shaken):
-            self.shake(sums)
+            self.shake(0, sums)
         for m in ti.static(self.flowing):
             for p in range(self.range[m], self.range[m + 1]):
                 base, fx = self.locate(self.x[p])
                 self.p2g(m, p, base, fx, dt)
 
     @ti.kernel
-    def collect_parallel(self, dt: ti.f32, sums: ti.types.ndarray(ti.f64, 1)):
+    def collect_parallel(self, dt: ti.f32, sums: ti.types.ndarray(ti.f64, 2)):
         for axis in ti.static(range(self.dim)):
             for I in ti.grouped(self.grid):
                 if I[axis] < 2:
@@ -653,15 +657,15 @@ class _Kernels:
                     self.ghost(axis, I[axis], I, dt, False)
         for m in ti.static(self.flowing):
             for p in range(self.range[m], self.range[m + 1]):
-                ti.atomic_max(sums[5], ti.cast(self.g2p(p, dt), ti.f64))
+                ti.atomic_max(sums[0, 5], ti.cast(self.g2p(p, dt), ti.f64))
         for I in ti.grouped(self.grid):
             self.clear(I)
 
     @ti.kernel
-    def report_parallel(self, position: ti.types.ndarray(ti.f32, 2), sums: ti.types.ndarray(ti.f64, 1)):
+    def report_parallel(self, position: ti.types.ndarray(ti.f32, 3), sums: ti.types.ndarray(ti.f64, 2)):
         for m in ti.static(range(len(self.models))):
             for p in range(self.range[m], self.range[m + 1]):
-                self.report(m, p, position, sums)
+                self.report(m, p, 0, position, sums)
 
     @ti.kernel
     def load(self, data: ti.types.ndarray(ti.f32, 2), numbers: ti.types.ndarray(ti.f32, 2)):
@@ -732,10 +736,10 @@ class _Kernels:
         for d in ti.static(range(self.dim)):
             x = self.x[p][d]
             astray = astray or not finite(x) or x < 0.5 or x >= float(ti.static(self.nodes[d])) - 1.5
-        sums[7] += ti.cast(astray, ti.f64)
+        sums[0, 7] += ti.cast(astray, ti.f64)
 
     @ti.kernel
-    def save(self, sums: ti.types.ndarray(ti.f64, 1)):
+    def save(self, sums: ti.types.ndarray(ti.f64, 2)):
         for p in range(self.range[ti.static(len(self.models))]):
             self.save_particle(p, sums)
 
@@ -812,21 +816,25 @@ class MPMSimulator:
     Overrides make the rungs of a solver ladder: ``cfl`` (Courant number; default the scene's), ``stiffness`` (factor on the
     elastic moduli), ``coarsen`` (factor on the grid spacing of the recorded resolution; implies the recorded particles),
     ``particles`` ("teacher": refined as the scene says; "recorded": the tracked set alone, on the recorded grid),
-    ``perturbation`` (length: random displacement of the start, for the chaos floor).
+    ``perturbation`` (length: random displacement of the start, for the chaos floor), ``frames`` (that ``advance`` hands out at once, as a
+    model that predicts so many does: one launch, and one plan of the time step, for all).
 
     A scene's ``time_step`` holds unless ``cfl`` is given. ``unguarded_step`` [s] is for ``sim.stability`` alone: a fixed step that nothing
     refuses or shortens, to see where the solver really becomes unstable.
     """
 
     def __init__(self, *, name: str = "mpm", kind: Kind = "reference", cfl: float | None = None, stiffness: float = 1.0, coarsen: float = 1.0,
-                 particles: str = "teacher", perturbation: float = 0.0, serial: bool | None = None,
+                 particles: str = "teacher", perturbation: float = 0.0, frames: int = 1, serial: bool | None = None,
                  unguarded_step: float | None = None):
         if particles not in ("teacher", "recorded"):
             raise InputError(name, "particles", particles, "must be teacher or recorded")
+        if frames < 1:
+            raise InputError(name, "frames", frames, "must be at least 1")
         if particles == "teacher" and coarsen != 1.0:
             raise InputError(name, "coarsen", coarsen, "a coarser grid needs particles: recorded")
         self.name, self.kind = name, kind
-        self.settings = {"cfl": cfl, "stiffness": stiffness, "coarsen": coarsen, "particles": particles, "perturbation": perturbation}
+        self.settings = {"cfl": cfl, "stiffness": stiffness, "coarsen": coarsen, "particles": particles, "perturbation": perturbation,
+                         "frames": frames}
         self.serial, self.unguarded_step = serial, unguarded_step
         self.compile_seconds = 0.0
         self._kernels: _Kernels | None = None
@@ -866,7 +874,7 @@ class MPMSimulator:
         data = np.ascontiguousarray(np.concatenate([cell, particles.velocity], 1).astype(np.float32))
         self._acceleration, self._frame, self._boundary = scene.acceleration(), 0, scene.boundary.astype(np.float32)
         self._cfl = self._courant(scene)
-        self._position = np.zeros((len(position), scene.dim), np.float32)
+        self._position = np.zeros((1, len(position), scene.dim), np.float32)
         with compiling(scene.dim) if fresh else nullcontext():
             kernels.load(data, self._table(scene, particles, cells))
             if structure.obstacles != "none":
@@ -1045,13 +1053,17 @@ class MPMSimulator:
             "grid_spacing": dx, "wave_speed": wave_speed, "substeps_per_frame": substeps,
         }
 
-    def _run(self, substeps: int, dt: float, keep: bool) -> np.ndarray:
-        sums = np.concatenate([np.zeros(SUMS), self._acceleration[min(self._frame, len(self._acceleration) - 1)]])
-        self._kernels.frame(substeps, dt, int(keep), self._position, sums)
-        kinetic, potential, elastic = sums[:3].tolist()
+    def _run(self, substeps: int, dt: float, keep: bool, frames: int = 1) -> np.ndarray:
+        """Frames of as many steps; ``_position`` [frames, particles, dim] and what they add up to, [frames, SUMS + dim]."""
+        number = np.minimum(self._frame + np.arange(frames), len(self._acceleration) - 1)
+        sums = np.concatenate([np.zeros((frames, SUMS)), self._acceleration[number]], 1)
+        if len(self._position) != frames:
+            self._position = np.zeros((frames, *self._position.shape[1:]), np.float32)
+        self._kernels.frame(frames, substeps, dt, int(keep), self._position, sums)
+        kinetic, potential, elastic, speed, wave_speed = sums[-1, :5].tolist()
         self._diagnostics = {
-            "kinetic_energy": kinetic, "potential_energy": potential, "elastic_energy": elastic, "max_speed": float(np.sqrt(sums[3])),
-            "wave_speed": float(sums[4]), "substeps": float(substeps), "dt": dt,
+            "kinetic_energy": kinetic, "potential_energy": potential, "elastic_energy": elastic, "max_speed": float(np.sqrt(speed)),
+            "wave_speed": wave_speed, "substeps": float(substeps), "dt": dt,
         }
         return sums
 
@@ -1073,22 +1085,32 @@ class MPMSimulator:
         divide the frame exactly. A frame whose Courant number outgrew the plan is taken back and repeated with half the step; where the
         step is fixed, it ends the trajectory.
         """
-        scene, known, fixed = self._scene, self._diagnostics, self._fixed(self._scene)
-        felt = scene.gravity - self._acceleration[min(self._frame, len(self._acceleration) - 1)]
-        reach = float(np.linalg.norm(felt)) * scene.frame_step
-        substeps = self._substeps(scene, self.dx, known["wave_speed"], known["max_speed"] + reach)
+        scene, fixed = self._scene, self._fixed(self._scene)
+        substeps = self._planned(1)
         for attempt in range(1 if fixed else MAX_HALVINGS + 1):
             dt = scene.frame_step / substeps
-            sums = self._run(substeps, dt, keep=attempt == 0)
+            sums = self._run(substeps, dt, keep=attempt == 0)[0]
             if sums[7] > 0:
                 raise SimulationError(self._sick() or "a particle is off the grid")
             if self._acceptable(sums, dt):
                 self._frame += 1
-                return np.concatenate([self._position[self._tracked], self._boundary])
+                return self._recorded()[0]
             self._restore()
             substeps *= 2
         why = f"the fixed time step {dt:.3g} s gave no" if fixed else f"time step fell below {dt:.3g} s without a"
         raise SimulationError(self._sick() or f"{why} finite, stable frame")
+
+    def _planned(self, frames: int) -> int:
+        """Substeps a frame by what is known and what gravity can add to the speed within so many frames."""
+        scene, known = self._scene, self._diagnostics
+        number = np.minimum(self._frame + np.arange(frames), len(self._acceleration) - 1)
+        reach = float(np.linalg.norm(scene.gravity - self._acceleration[number], axis=1).sum()) * scene.frame_step
+        return self._substeps(scene, self.dx, known["wave_speed"], known["max_speed"] + reach)
+
+    def _recorded(self) -> np.ndarray:
+        """[frames, recorded particles, dim]: of what ran last, kinematic ones last."""
+        moving = self._position[:, self._tracked]
+        return np.concatenate([moving, np.broadcast_to(self._boundary, (len(moving), *self._boundary.shape))], 1)
 
     def _sick(self) -> str | None:
         """What of the state no frame can begin with: the first that is not finite, or particles off the grid. None if it is sound."""
@@ -1120,7 +1142,7 @@ class MPMSimulator:
     def state(self) -> dict[str, np.ndarray]:
         """All simulated particles, in float64: ``position`` [length], ``velocity`` [length/s], [n, dim] each, ``velocity gradient`` [1/s]
         [n, dim, dim], and what materials carry, named as in ``plan``: [particles of that material] or [particles of that material, floats]."""
-        kernels, scene, n = self._kernels, self._scene, len(self._position)
+        kernels, scene, n = self._kernels, self._scene, self._position.shape[1]
         lower, ends = np.array(scene.bounds)[:, 0], kernels.range.to_numpy()
         found = {"position": lower + (kernels.x.to_numpy()[:n].astype(float) - WALL) * self.dx}
         found["velocity"] = kernels.v.to_numpy()[:n, : scene.dim].astype(float)
@@ -1176,4 +1198,17 @@ class MPMSimulator:
             self.frame()
 
     def advance(self) -> np.ndarray:
-        return self.frame()[None]
+        """The next ``frames`` frames, all of as many substeps; one by one where that does not do."""
+        frames, known = self.settings["frames"], self._diagnostics
+        if frames == 1:
+            return self.frame()[None]
+        substeps = self._planned(frames)
+        dt = self._scene.frame_step / substeps
+        sums = self._run(substeps, dt, keep=True, frames=frames)
+        if not sums[0, 7] and all(self._acceptable(row, dt) for row in sums):
+            self._frame += frames
+            return self._recorded()
+        if not sums[0, 7]:
+            self._restore()
+        self._diagnostics = known
+        return np.stack([self.frame() for _ in range(frames)])

@@ -36,7 +36,7 @@ WIDE = {"bounds": [[0.0, 2.0], [0.0, 1.0]], "cells": [64, 32]}
 
 def state(solver):
     """Positions, velocities [n, 2], velocity gradients [n, 2, 2], in float64."""
-    kernels, n = solver._kernels, len(solver._position)
+    kernels, n = solver._kernels, solver._position.shape[1]
     gradient = np.stack([column.to_numpy()[:n, :2] for column in kernels.C], -1).astype(float)
     return (kernels.x.to_numpy()[:n].astype(float) - WALL) * solver.dx, kernels.v.to_numpy()[:n, :2].astype(float), gradient
 
@@ -120,9 +120,9 @@ def column(water):
     for number in range(200):
         water.frame()
         if number >= 100:
-            J = water._kernels.materials[0].J.to_numpy()[: len(water._position)].astype(float)
+            J = water._kernels.materials[0].J.to_numpy()[: water._position.shape[1]].astype(float)
             pressure.append(rho * c**2 / 7 * (J**-7 - 1))
-            height.append(water._position[:, 1].copy())
+            height.append(water._position[0, :, 1].copy())
             kinetic.append(water.diagnostics()["kinetic_energy"])
     p, y = np.mean(pressure, 0), np.mean(height, 0)
     layer = np.round(what.particles().position[:, 1] / what.spacing - 0.5).astype(int)

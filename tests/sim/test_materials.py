@@ -541,7 +541,7 @@ def test_the_time_step_follows_lambda(model):
 
 
 def state(solver):
-    kernels, n = solver._kernels, len(solver._position)
+    kernels, n = solver._kernels, solver._position.shape[1]
     return kernels.x.to_numpy()[:n].astype(float) - WALL, kernels.v.to_numpy()[:n, :2].astype(float)
 
 

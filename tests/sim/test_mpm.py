@@ -14,6 +14,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from experiments import Experiments  # noqa: E402
 
+from sim.errors import InputError
 from sim.generate import simulate  # noqa: E402
 from sim.mpm import solver as solver_module  # noqa: E402
 from sim.mpm.decomposition import assemble2, assemble3, decompose2, decompose3, expm1, log1p  # noqa: E402
@@ -367,7 +368,7 @@ def state(solver, n):
 def test_a_linear_velocity_field_survives_the_transfers(water):
     """APIC carries linear fields exactly (Jiang et al. 2015), also at the surface of a body. The field has no divergence, so no pressure answers."""
     water.load(scene([("water", [0.25, 0.25], [0.75, 0.75])], gravity=[0.0, 0.0]))
-    n = len(water._position)
+    n = water._position.shape[1]
     x = state(water, n)[0]
     A = np.array([[1.0, 3.0], [-2.0, -1.0]])
     field = x @ A.T + [0.5, -0.25]
@@ -382,7 +383,7 @@ def test_a_linear_velocity_field_survives_the_transfers(water):
 def test_momentum_and_angular_momentum_of_random_motion(water):
     """Pressure and transfers between particles change neither: what is left is rounding, far below 1e-6 of sum |m v|."""
     water.load(scene([("water", [0.25, 0.25], [0.75, 0.75])], gravity=[0.0, 0.0]))
-    n = len(water._position)
+    n = water._position.shape[1]
     put(water, np.random.default_rng(0).normal(size=(n, 2)) + [0.3, -0.2])
 
     def momenta():
@@ -554,6 +555,32 @@ def test_a_volume_turned_inside_out_twice_is_not_sound():
     assert drops.intact.tolist() == [0, 1]
     drops.strain(once)
     assert drops.intact.tolist() == [0, 1] and drops.model.J.to_numpy()[1] == pytest.approx(np.exp(-1), rel=1e-4)
+
+
+@pytest.mark.parametrize("changes", [{}, {"container": {"sines": [{"amplitude": [3.0, 0.0], "frequency": 2.0, "phase": 30.0}]}}])
+def test_frames_at_once_are_those_one_by_one(changes):
+    """A fixed step: the same bits, and the diagnostics of the last. 16 frames of the 21 - 1 are left over twice."""
+    what = Scene.from_dict(DROP.to_dict() | {"time_step": DROP.frame_step / 8, "frames": 21} | changes)
+    one, many = MPMSimulator(), MPMSimulator(frames=8)
+    expected = run(one, what, 16)
+    many.load(what)
+    assert (np.concatenate([many.advance(), many.advance()]) == expected).all()
+    assert many.diagnostics() == one.diagnostics()
+
+
+def test_frames_at_once_that_outgrow_their_step_are_run_one_by_one(water, monkeypatch):
+    """All of a block is planned by its start. Two of the four frames are refused: it is taken back, and each plans for itself."""
+    expected = run(water, DROP, 4)
+    many, looked = MPMSimulator(frames=4), []
+    many.load(DROP)
+    original = many._acceptable
+    monkeypatch.setattr(many, "_acceptable", lambda sums, dt: looked.append(1) or (len(looked) != 3 and original(sums, dt)))
+    assert (many.advance() == expected).all() and len(looked) == 3 + 4
+
+
+def test_less_than_a_frame_at_once_is_refused():
+    with pytest.raises(InputError, match="frames = 0: must be at least 1"):
+        MPMSimulator(frames=0)
 
 
 def test_a_step_that_would_need_too_many_halvings_is_given_up(water, monkeypatch):

@@ -17,8 +17,8 @@ def family(**changes):
 
 
 def shards(folder):
-    """Bytes of every shard by name."""
-    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.glob("*/*.h5"))}
+    """Bytes of every finished shard by name: a kill may leave a temporary one, whose name begins with a dot."""
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.glob("*/[!.]*.h5"))}
 
 
 def without_cost(folder):
