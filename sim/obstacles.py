@@ -7,7 +7,9 @@ kinematic particles (``boundary_particles``).
 
 Decision: a solid must be at least ``THINNEST`` grid cells thick. A quadratic B-spline reaches 1.5 cells, so across a plate of that
 thickness a particle on one face touches only nodes inside the plate or on its own side: nothing is pushed through, and both faces
-work. A ramp without thickness would need two velocities on the nodes beside it.
+work. A ramp without thickness would need two velocities on the nodes beside it. From three cells on no node is reached from both faces:
+then those inside carry the velocity on across the surface (``sim.mpm.solver.column_table``), and what rests there has its own pressure. In
+thinner plates they are held, a staircase that water feels as up to several times its pressure in the layer next to it.
 """
 
 from __future__ import annotations
