@@ -847,8 +847,12 @@ class MPMSimulator:
         structure, nodes = self._structure(scene), tuple(int(c) + 2 * WALL + 1 for c in self._cells(scene))
         capacity = _capacity(len(particles.position))
         old, fresh, columns = self._kernels, False, self._columns(scene, nodes)
-        if old is None or old.structure != structure or old.nodes != nodes or old.capacity < capacity or old.columns_at_most < len(columns):
-            self._kernels, fresh = _Kernels(structure, capacity, nodes, _power_of_two(len(columns)), serial), True
+        alike = old is not None and old.structure == structure and old.nodes == nodes
+        if not alike or old.capacity < capacity or old.columns_at_most < len(columns):
+            # Never less room than before, lest scenes with many particles and scenes with many columns compile anew in turns.
+            room = (old.capacity, old.columns_at_most) if alike else (0, 0)
+            capacity, at_most = max(capacity, room[0]), max(_power_of_two(len(columns)), room[1])
+            self._kernels, fresh = _Kernels(structure, capacity, nodes, at_most, serial), True
         kernels = self._kernels
         lower, upper = np.array(scene.bounds).T
         cells = self._cells(scene)
@@ -1030,8 +1034,9 @@ class MPMSimulator:
             left_out["rigid bodies"] = "none in the scene"
         else:
             fields |= RigidBodies.sizes(dim, *structure.rigid, n, nodes)
-            kernels[2:] = ["save", "expel_rigid", "spread_serial", "meet_rigid", "solve_rigid", "move_rigid", "collect_serial", "report_parallel",
-                           "load_rigid", "keep_rigid"]
+            kernels.remove("frame_serial")
+            kernels += ["save", "expel_rigid", "spread_serial", "meet_rigid", "solve_rigid", "move_rigid", "collect_serial", "report_parallel",
+                        "load_rigid", "keep_rigid"]
         gravity = float(np.linalg.norm(np.array(scene.gravity) - scene.acceleration(), axis=1).max())
         start = float(np.sqrt((particles.velocity**2).sum(1).max()))
         fall = float(np.sqrt(start**2 + 2 * gravity * np.linalg.norm(upper - lower)))

@@ -443,6 +443,20 @@ def test_what_has_no_obstacle_builds_none(wet):
     assert not hasattr(simulator._kernels, "solids")
 
 
+def test_many_particles_and_many_columns_do_not_compile_in_turns():
+    """The first outgrows the second's fields in columns, the second the first's in particles."""
+    floor = {"kind": "floor", "vertices": [[0.0, 0.1], [1.0, 0.3]]}
+    few = scene([floor], [{"material": "water", "kind": "box", "lower": [0.4, 0.6], "upper": [0.6, 0.8]}])
+    many = scene([{"kind": "ball", "center": [0.5, 0.2], "radius": 0.05}],
+                 [{"material": "water", "kind": "box", "lower": [0.0, 0.5], "upper": [1.0, 1.0]}], particles_per_cell=3)
+    simulator, rooms = MPMSimulator(), []
+    for what in (few, many, few, many):
+        simulator.load(what)
+        rooms.append((simulator._kernels.capacity, simulator._kernels.columns_at_most))
+    assert rooms[0][0] < rooms[1][0] and rooms[0][1] == rooms[1][1] and rooms[1:] == rooms[1:2] * 3
+    assert simulator.plan(many)["fields"]["obstacle foot"][1] < rooms[0][1], "alone it needs fewer columns"
+
+
 def test_parallel_kernels_agree_with_serial_ones(wet):
     what = scene([PLATE | {"friction": 0.3}, {"kind": "ball", "center": [0.4, 0.2], "radius": 0.1}], cells=[16, 16])
     serial, parallel = MPMSimulator(), MPMSimulator(serial=False)
