@@ -229,7 +229,8 @@ class RigidBodies:
 
     @ti.func
     def find_water(self, dt):
-        """Contacts with the grid: the feet, on each face, of particles within a spacing of it."""
+        """Contacts with the grid: the feet, on each face, of particles within a spacing of it. Where faces meet at an obtuse angle, feet beyond
+        the edge are none: with 48 sides, a body of half a cell more floated a fifth of its radius too high."""
         cell = self.cell_mass()
         half = self.half[None]
         for b in range(self.count[None]):
@@ -244,7 +245,12 @@ class RigidBodies:
                         offset = self.radius[b]
                     beyond = X.dot(n) - offset
                     if beyond > -2.0 * half:
-                        self.wet(b, self.centre[b] + R @ (X - beyond * n), -(R @ n), cell, dt)
+                        foot, on = X - beyond * n, True
+                        for other in range(self.faces[b]):
+                            plane = self.planes[b, other]
+                            on = on and foot.dot(ti.Vector([plane[0], plane[1], plane[2]])) - plane[3] < 1e-3
+                        if on:
+                            self.wet(b, self.centre[b] + R @ foot, -(R @ n), cell, dt)
 
     @ti.func
     def wet(self, b, at, normal, cell, dt):

@@ -6,7 +6,7 @@ from scipy.spatial.distance import pdist
 
 from sim.generate import simulate
 from sim.mpm import solver as solver_module
-from sim.mpm.rigid import rotation, turned
+from sim.mpm.rigid import GRID, rotation, turned
 from sim.mpm.solver import WALL, MPMSimulator
 from sim.scene import Scene
 from sim.taichi_runtime import start_taichi, ti
@@ -341,6 +341,30 @@ def test_no_particle_of_a_body_enters_an_obstacle_or_leaves_the_box():
         assert combine(what.obstacles, last)[0].min() > half - 0.05 * simulator.dx
     assert max(np.diff(levels)) < 1e-3 * levels[0]
     assert simulator.diagnostics()["max_speed"] < 0.5, "it comes to rest"
+
+
+@pytest.mark.parametrize("corners", [3, 6, 48])
+def test_contacts_with_water_are_on_the_faces(corners):
+    """One or two a spacing along the outline of an immersed polygon. Feet of particles on the planes of all faces near them, beyond the edges,
+    made one of 48 sides float as if half a cell larger."""
+    angle = 2 * np.pi / corners * np.arange(corners)
+    outline = (np.array([0.5, 0.4]) + 0.15 * np.stack([np.cos(angle), np.sin(angle)], 1)).tolist()
+    around = [box([0.0, 0.0], [1.0, 0.25]), box([0.0, 0.25], [0.35, 0.55]), box([0.65, 0.25], [1.0, 0.55]), box([0.0, 0.55], [1.0, 0.75])]
+    what = scene([("water", each) for each in around] + [("wood", {"kind": "polygon", "vertices": outline})], {"water": WATER, "wood": WOOD})
+    simulator = MPMSimulator()
+    simulator.load(what)
+    simulator.frame()
+    bodies, motion = simulator.rigid, simulator.rigid.motion()
+    found = bodies.pair.to_numpy()[: bodies.touching.to_numpy()][:, 1] == GRID
+    places = bodies.spot.to_numpy()[: len(found)][found, :2].astype(float) - motion["centre"][0, :2]
+    planes = bodies.planes.to_numpy()[0, :corners].astype(float)
+    turn = 2 * np.arctan2(motion["turn"][0, 3], motion["turn"][0, 0])
+    places = places @ [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
+    beyond = (places @ planes[:, :2].T - planes[:, 3]).max(1)
+    # The turn and the shift of the substep that followed.
+    assert np.abs(beyond).max() < 0.05
+    around = 2 * corners * 0.15 * np.sin(np.pi / corners) / what.spacing
+    assert 0.7 * around < len(places) < 2 * around
 
 
 def test_types_and_trajectory(blocks):
