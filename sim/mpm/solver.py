@@ -415,6 +415,8 @@ class _Kernels:
                     for d in ti.static(range(self.dim)):
                         u[d] = a * self.grid[node][d] + b * self.grid[node + step][d] + dt * self.pull[None][d]
                         old[d], normal[d] = self.impulse[k][d], self.face[k][d]
+                    if self.foot[k][2 * self.dim] < 0 and self.grid[node - step][self.dim] > m1:
+                        normal = -normal
                     stuck = old - u / (a * give0 + b * give1)
                     pressed = stuck.dot(normal)
                     now = ti.max(pressed, 0.0) * normal
@@ -759,7 +761,8 @@ def column_table(obstacles: list, frictions: list, lower: np.ndarray, dx: float,
     A column starts at each node inside whose neighbour, along the main direction of its normal, is outside. Node 0 is the one of the two
     that is nearer to the surface, so that it never lacks mass where those behind have it; the column with the shallowest start has what
     several could claim. What is inside, within reach of particles, and in no column is held by itself (weight 1, step 0): corners, and all that
-    is thinner than ``THICK``, lest particles beyond a plate be moved through the nodes they share.
+    is thinner than ``THICK``, lest particles beyond a plate be moved through the nodes they share. Of the latter there may be but one line, which
+    serves both faces (-1 nodes behind): its normal is to the side, by the step, that has more mass on the next node.
     """
     dim, shape = len(nodes), np.array(nodes)
     index = np.stack(np.meshgrid(*[np.arange(n) for n in nodes], indexing="ij"), -1).reshape(-1, dim)
@@ -777,7 +780,7 @@ def column_table(obstacles: list, frictions: list, lower: np.ndarray, dx: float,
     thin = np.zeros(len(index), bool)
     thin[near] = combine(obstacles, lower + (index[near] - (THICK + distance[near, None]) * normal[near] - WALL) * dx)[0] > 0
     step = (np.abs(normal[near]) == np.abs(normal[near]).max(1, keepdims=True)).cumsum(1).cumsum(1) == 1  # the first of equal ones
-    step = step * np.where(normal[near] > 0, 1, -1)
+    step = ways = step * np.where(normal[near] > 0, 1, -1)
     out = flat(index[near] + step)
     depth = distance[near] / (distance[near] - distance[out])
     shallow = depth <= 0.5
@@ -801,9 +804,11 @@ def column_table(obstacles: list, frictions: list, lower: np.ndarray, dx: float,
     _, facing, which = combine(obstacles, lower + (index[near_of] + depth[:, None] * step - WALL) * dx)
     weight = np.where(shallow, 1 - depth, 2 - depth)
     columns = np.column_stack([index[node], step, behind, facing, friction[which], weight])
-    held = near[~claimed[near]]
-    zero, one = np.zeros((len(held), dim + 1)), np.ones(len(held))
-    return np.concatenate([columns, np.column_stack([index[held], zero, normal[held], friction[nearest[held]], one])]).astype(np.float32)
+    alone = ~claimed[near]
+    held, aside = near[alone], ways[alone]
+    faced = thin[held] & (flat(index[held] + aside) >= 0) & (flat(index[held] - aside) >= 0)
+    rest = np.column_stack([index[held], aside * faced[:, None], -1 * faced, normal[held], friction[nearest[held]], np.ones(len(held))])
+    return np.concatenate([columns, rest]).astype(np.float32)
 
 
 class MPMSimulator:
