@@ -782,7 +782,8 @@ def column_table(obstacles: list, frictions: list, lower: np.ndarray, dx: float,
     step = (np.abs(normal[near]) == np.abs(normal[near]).max(1, keepdims=True)).cumsum(1).cumsum(1) == 1  # the first of equal ones
     step = ways = step * np.where(normal[near] > 0, 1, -1)
     out = flat(index[near] + step)
-    depth = distance[near] / (distance[near] - distance[out])
+    with np.errstate(divide="ignore", invalid="ignore"):  # where the next node is as deep, or off the grid, no column starts
+        depth = distance[near] / (distance[near] - distance[out])
     shallow = depth <= 0.5
     node = np.where(shallow, near, out)
     after = flat(index[node] + step)
@@ -802,6 +803,8 @@ def column_table(obstacles: list, frictions: list, lower: np.ndarray, dx: float,
         behind[growing] = k
         claimed[ghost[growing]] = True
     _, facing, which = combine(obstacles, lower + (index[near_of] + depth[:, None] * step - WALL) * dx)
+    # At an edge, or in a notch, the nearest surface may be another that faces elsewhere.
+    facing = np.where((facing * step).sum(1, keepdims=True) > 0.5, facing, normal[near_of])
     weight = np.where(shallow, 1 - depth, 2 - depth)
     columns = np.column_stack([index[node], step, behind, facing, friction[which], weight])
     alone = ~claimed[near]

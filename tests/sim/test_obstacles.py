@@ -321,6 +321,18 @@ def test_columns_of_a_slope_take_turns():
     assert (table[table[:, 4] > 0, 2:4] == [1, 0]).all()
 
 
+@pytest.mark.parametrize("content", [
+    {"kind": "halfspace", "point": [5.0, 2.5], "normal": [1.0, -1.0]},
+    {"kind": "floor", "vertices": [[0, 6], [3.6, 5.4], [4, 1.2], [4.4, 5.4], [8, 6]]},
+])  # fmt: skip
+def test_columns_face_outwards(content):
+    """In a notch too, whose nearest surface may be the other side's; and the arithmetic warns of nothing."""
+    with np.errstate(all="raise"):
+        found = columns(content)
+    across = [np.dot(row[:2], row[3:5]) for row in found.values() if any(row[:2]) and row[2] >= 0]
+    assert len(across) > 6 and min(across) > 0.5
+
+
 def test_thin_plates_hold_their_nodes():
     found = columns({"kind": "segment", "start": [-5.0, 3.0], "end": [15.0, 3.0], "thickness": 1.6})
     # One line for both faces.
