@@ -83,7 +83,7 @@ def _capacity(particles: int) -> int:
 
 @ti.data_oriented
 class _Kernels:
-    """Fields and compiled code for one ``Structure``; capacities in particles and nodes.
+    """Fields and compiled code for one ``Structure``; capacities in particles, nodes and obstacles' columns.
 
     Vectors that meet in the transfers have four equal lanes whatever the dimension: a node is (momentum, mass, 0), later (velocity, 1, 0);
     a particle's velocity carries the gathered 1 along. Uniform lanes are what the compiler turns into vector instructions; shorter
