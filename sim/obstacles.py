@@ -221,7 +221,7 @@ class Mesh(_Solid):
         sign = np.asarray(pyvista.PolyData(self._into(cloud.points)).compute_implicit_distance(surface)["implicit_distance"], float)
         hidden = self._beyond(np.asarray(surface.points, float)[np.asarray(surface.regular_faces)])
         if hidden.any() and not hidden.all():
-            surface = surface.extract_cells(~hidden).extract_surface()
+            surface = surface.remove_cells(hidden)
         cells, foot = surface.find_closest_cell(cloud.points, return_closest_point=True)
         return _signed(points, np.asarray(foot, float), sign < 0, np.asarray(surface.face_normals, float)[cells])
 

@@ -83,7 +83,7 @@ def _capacity(particles: int) -> int:
 
 @ti.data_oriented
 class _Kernels:
-    """Fields and compiled code for one ``Structure``; capacities in particles and nodes.
+    """Fields and compiled code for one ``Structure``; capacities in particles, nodes and obstacles' columns.
 
     Vectors that meet in the transfers have four equal lanes whatever the dimension: a node is (momentum, mass, 0), later (velocity, 1, 0);
     a particle's velocity carries the gathered 1 along. Uniform lanes are what the compiler turns into vector instructions; shorter
@@ -415,6 +415,8 @@ class _Kernels:
                     for d in ti.static(range(self.dim)):
                         u[d] = a * self.grid[node][d] + b * self.grid[node + step][d] + dt * self.pull[None][d]
                         old[d], normal[d] = self.impulse[k][d], self.face[k][d]
+                    if self.foot[k][2 * self.dim] < 0 and self.grid[node - step][self.dim] > m1:
+                        normal = -normal
                     stuck = old - u / (a * give0 + b * give1)
                     pressed = stuck.dot(normal)
                     now = ti.max(pressed, 0.0) * normal
@@ -763,7 +765,8 @@ def column_table(obstacles: list, frictions: list, lower: np.ndarray, dx: float,
     A column starts at each node inside whose neighbour, along the main direction of its normal, is outside. Node 0 is the one of the two
     that is nearer to the surface, so that it never lacks mass where those behind have it; the column with the shallowest start has what
     several could claim. What is inside, within reach of particles, and in no column is held by itself (weight 1, step 0): corners, and all that
-    is thinner than ``THICK``, lest particles beyond a plate be moved through the nodes they share.
+    is thinner than ``THICK``, lest particles beyond a plate be moved through the nodes they share. Of the latter there may be but one line, which
+    serves both faces (-1 nodes behind): its normal is to the side, by the step, that has more mass on the next node.
     """
     dim, shape = len(nodes), np.array(nodes)
     index = np.stack(np.meshgrid(*[np.arange(n) for n in nodes], indexing="ij"), -1).reshape(-1, dim)
@@ -781,9 +784,10 @@ def column_table(obstacles: list, frictions: list, lower: np.ndarray, dx: float,
     thin = np.zeros(len(index), bool)
     thin[near] = combine(obstacles, lower + (index[near] - (THICK + distance[near, None]) * normal[near] - WALL) * dx)[0] > 0
     step = (np.abs(normal[near]) == np.abs(normal[near]).max(1, keepdims=True)).cumsum(1).cumsum(1) == 1  # the first of equal ones
-    step = step * np.where(normal[near] > 0, 1, -1)
+    step = ways = step * np.where(normal[near] > 0, 1, -1)
     out = flat(index[near] + step)
-    depth = distance[near] / (distance[near] - distance[out])
+    with np.errstate(divide="ignore", invalid="ignore"):  # where the next node is as deep, or off the grid, no column starts
+        depth = distance[near] / (distance[near] - distance[out])
     shallow = depth <= 0.5
     node = np.where(shallow, near, out)
     after = flat(index[node] + step)
@@ -803,11 +807,15 @@ def column_table(obstacles: list, frictions: list, lower: np.ndarray, dx: float,
         behind[growing] = k
         claimed[ghost[growing]] = True
     _, facing, which = combine(obstacles, lower + (index[near_of] + depth[:, None] * step - WALL) * dx)
+    # At an edge, or in a notch, the nearest surface may be another that faces elsewhere.
+    facing = np.where((facing * step).sum(1, keepdims=True) > 0.5, facing, normal[near_of])
     weight = np.where(shallow, 1 - depth, 2 - depth)
     columns = np.column_stack([index[node], step, behind, facing, friction[which], weight])
-    held = near[~claimed[near]]
-    zero, one = np.zeros((len(held), dim + 1)), np.ones(len(held))
-    return np.concatenate([columns, np.column_stack([index[held], zero, normal[held], friction[nearest[held]], one])]).astype(np.float32)
+    alone = ~claimed[near]
+    held, aside = near[alone], ways[alone]
+    faced = thin[held] & (flat(index[held] + aside) >= 0) & (flat(index[held] - aside) >= 0)
+    rest = np.column_stack([index[held], aside * faced[:, None], -1 * faced, normal[held], friction[nearest[held]], np.ones(len(held))])
+    return np.concatenate([columns, rest]).astype(np.float32)
 
 
 class MPMSimulator:
@@ -855,8 +863,12 @@ class MPMSimulator:
         structure, nodes = self._structure(scene), tuple(int(c) + 2 * WALL + 1 for c in self._cells(scene))
         capacity = _capacity(len(particles.position))
         old, fresh, columns = self._kernels, False, self._columns(scene, nodes)
-        if old is None or old.structure != structure or old.nodes != nodes or old.capacity < capacity or old.columns_at_most < len(columns):
-            self._kernels, fresh = _Kernels(structure, capacity, nodes, _power_of_two(len(columns)), serial), True
+        alike = old is not None and old.structure == structure and old.nodes == nodes
+        if not alike or old.capacity < capacity or old.columns_at_most < len(columns):
+            # Never less room than before, lest scenes with many particles and scenes with many columns compile anew in turns.
+            room = (old.capacity, old.columns_at_most) if alike else (0, 0)
+            capacity, at_most = max(capacity, room[0]), max(_power_of_two(len(columns)), room[1])
+            self._kernels, fresh = _Kernels(structure, capacity, nodes, at_most, serial), True
         kernels = self._kernels
         lower, upper = np.array(scene.bounds).T
         cells = self._cells(scene)
@@ -1038,8 +1050,9 @@ class MPMSimulator:
             left_out["rigid bodies"] = "none in the scene"
         else:
             fields |= RigidBodies.sizes(dim, *structure.rigid, n, nodes)
-            kernels[2:] = ["save", "expel_rigid", "spread_serial", "meet_rigid", "solve_rigid", "move_rigid", "collect_serial", "report_parallel",
-                           "load_rigid", "keep_rigid"]
+            kernels.remove("frame_serial")
+            kernels += ["save", "expel_rigid", "spread_serial", "meet_rigid", "solve_rigid", "move_rigid", "collect_serial", "report_parallel",
+                        "load_rigid", "keep_rigid"]
         gravity = float(np.linalg.norm(np.array(scene.gravity) - scene.acceleration(), axis=1).max())
         start = float(np.sqrt((particles.velocity**2).sum(1).max()))
         fall = float(np.sqrt(start**2 + 2 * gravity * np.linalg.norm(upper - lower)))

@@ -49,6 +49,10 @@ PARTS = {
     "rigid": {"materials": {"water": MATERIALS["water"], "box": {"model": "rigid", "density": 500.0}},
               "bodies": [{"material": "water", "shape": {"kind": "box", "size": [0.4, 0.3]}},
                          {"material": "box", "shape": {"kind": "box", "size": [0.2, 0.1]}}]},
+    "rigid among obstacles": {"obstacles": [{"kind": "ball", "radius": 0.1, "center": [0.2, 0.2]}],
+                              "materials": {"water": MATERIALS["water"], "box": {"model": "rigid", "density": 500.0}},
+                              "bodies": [{"material": "water", "shape": {"kind": "box", "size": [0.3, 0.2]}, "center": [0.3, 0.8]},
+                                         {"material": "box", "shape": {"kind": "box", "size": [0.2, 0.1]}, "center": [0.7, 0.5]}]},
     "material": {"materials": {"water": MATERIALS["water"], "brine": MATERIALS["water"]},
                  "bodies": [{"material": name, "shape": {"kind": "box", "size": [0.3, 0.3]}} for name in ("water", "brine")]},
     "dimension": {"dim": 3, "bounds": [[0.0, 1.0]] * 3, "gravity": [0.0, -9.8, 0.0], "cells": [12, 12, 12],
@@ -67,7 +71,7 @@ def test_parts_of_a_scene_build_what_the_plan_says(part, built):
     assert built["kernels"] == set(promised["kernels"])
     bare = MPMSimulator().plan(family("water", frames=3).sample(0))
     own = {"obstacles": "signed distance", "container": "changing gravity", "rigid": "rigid bodies", "material": "material of a particle",
-           "dimension": "third dimension"}[part]
+           "dimension": "third dimension"}[part.split()[0]]
     assert own in bare["left_out"] and own not in promised["left_out"]
     of_the_new = {f"{what} of brine" for what in ("F", "decomposition", "viscosity")} if part == "material" else set()
     assert set(promised["left_out"]) - set(bare["left_out"]) <= {"obstacle friction", "deformation of rigid bodies of box"} | of_the_new
