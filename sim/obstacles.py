@@ -10,6 +10,9 @@ thickness a particle on one face touches only nodes inside the plate or on its o
 work. A ramp without thickness would need two velocities on the nodes beside it. From three cells on no node is reached from both faces:
 then those inside carry the velocity on across the surface (``sim.mpm.solver.column_table``), and what rests there has its own pressure. In
 thinner plates they are held, a staircase that water feels as up to several times its pressure in the layer next to it.
+
+Known: solids that only touch leak along the seam where it lies on a line of nodes, for there both say that their surface is near. Let them overlap
+by a cell.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ Decisions, measured on a CPU:
   plain additions and the launch is paid once a frame; one thread per trajectory is bitwise reproducible;
 - numbers (sizes, materials, time step) are arguments and fields, structure (dimension, materials present, wall kind) is
   compiled in: scenes that differ in numbers share kernels;
-- on a GPU the same functions run as parallel loops, two kernels a substep.
+- on a GPU the same functions run as parallel loops, two kernels a substep; what takes turns (obstacles' columns, contacts of bodies) on one thread.
 """
 
 import time
@@ -614,7 +614,7 @@ class _Kernels:
             sums[0, 5] = ti.max(sums[0, 5], ti.cast(self.collect(self.touched[0], self.touched[1], dt), ti.f64))
 
     def frame_parallel(self, frames, substeps, dt, keep, position, sums) -> None:
-        """The same, two kernels a substep (six with rigid bodies), all loops parallel (for a GPU)."""
+        """The same, two kernels a substep (six with rigid bodies), loops over particles and nodes parallel (for a GPU)."""
         if keep:
             self.save(sums)
             if self.has_rigid:
