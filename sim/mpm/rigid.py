@@ -380,6 +380,10 @@ class RigidBodies:
     @ti.func
     def find_contacts(self, dt):
         half = self.half[None]
+        # Where there is something that flows, walls and obstacles stop bodies a particle's width off: room for it to get under, and push.
+        film = half
+        if ti.static(len(self.kernels.flowing) > 0):
+            film = 3.0 * half
         self.touching[None] = 0
         for b in range(self.count[None]):
             for p in range(self.span[b][0], self.span[b][1]):
@@ -390,13 +394,13 @@ class RigidBodies:
                     axis, side = face // 2, face % 2
                     inward = ti.Vector.zero(ti.f32, 3)
                     inward[axis] = 1.0 - 2.0 * side
-                    gap = (x[axis] - ti.cast(self.kernels.extent[side][axis], ti.f32)) * inward[axis] - half
+                    gap = (x[axis] - ti.cast(self.kernels.extent[side][axis], ti.f32)) * inward[axis] - film
                     rough = self.kernels.coefficient[None] if ti.static(self.kernels.friction != "sticky") else NO_SLIP
                     self.touch(b, -1, at, inward, gap, rough, dt)
                 if ti.static(self.kernels.structure.obstacles != "none"):
                     clear, out = self.kernels.clearance(x)
                     friction = self.kernels.solids[ti.cast(x + 0.5, ti.i32)][self.dim + 1]
-                    self.touch(b, -1, at, lift(out), clear - half, friction if friction >= 0.0 else NO_SLIP, dt)
+                    self.touch(b, -1, at, lift(out), clear - film, friction if friction >= 0.0 else NO_SLIP, dt)
                 rough = self.kernels.coefficient[None] if ti.static(self.kernels.friction != "sticky") else NO_SLIP
                 for other in range(self.count[None]):
                     if other != b and (at - self.centre[other]).norm() < self.reach[other] + half + 1.0:

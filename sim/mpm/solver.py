@@ -791,7 +791,9 @@ def column_table(obstacles: list, frictions: list, lower: np.ndarray, dx: float,
     shallow = depth <= 0.5
     node = np.where(shallow, near, out)
     after = flat(index[node] + step)
-    starts = np.flatnonzero(~thin[near] & (out >= 0) & ~inside[out] & (after >= 0) & ~inside[after])
+    # A wall holds its own nodes along the step: a velocity drawn from one of them ran away, in the cell between a ramp's end and the wall.
+    walled = (((index[after] <= WALL) | (index[after] >= shape - 1 - WALL)) & (step != 0)).any(1)
+    starts = np.flatnonzero(~thin[near] & (out >= 0) & ~inside[out] & (after >= 0) & ~inside[after] & ~walled)
     starts = starts[np.sort(np.unique(node[starts], return_index=True)[1])]
     near_of, node, step, depth, shallow = near[starts], node[starts], step[starts], depth[starts], shallow[starts]
 
