@@ -32,7 +32,7 @@ def built(monkeypatch):
             entries = 1
             for edge in result.shape:
                 entries *= edge
-            found["fields"].append((4 * width(result), entries))
+            found["fields"].append(((8 if result.dtype == ti.f64 else 4) * width(result), entries))
             return result
 
         monkeypatch.setattr(owner, name, staticmethod(create) if isinstance(owner, type) else create)

@@ -1,30 +1,24 @@
 """Rigid bodies among the particles of the grid: exact shape, two-way coupling, contacts by impulses.
 
-A body is not on the grid. Points of its faces, where its outermost particles project, are contacts with the grid's velocity there:
+A body gives its particles' mass and momentum to the grid (v = V + w x r, C = [w]x, no stress). Nodes that it fills to ``SOLID`` or
+more (``share``) are the body's: whatever else gave them mass moves with it. Before walls and obstacles act on the grid, each body takes
+the rigid motion nearest to its nodes' velocities,
 
-    v(q) = sum_i w_i v_i,  (V(q) - v(q)).n >= -gap / tau,
+    minimise sum_i mu_i |A + w x (x_i - c) - v_i|^2,  mu_i = sum_p w_ip m (times the node's mass over the rigid mass there, if it is filled),
 
-w_i the splines' weights, none above the node's share of a full cell's mass, and made to add up to 1. An impulse J on the body acts at
-sum_i w_i x_i and is taken from the nodes as w_i J. So linear and angular momentum are what they were, exactly, and energy only falls: every step of
-the solver is a projection. The nodes that carry water into the body are thus left to extrapolate its motion up to the face, as ghosts do
-behind walls, wherever the face stands between nodes, and the pressure of water at rest, sum_i p w_i(q), meets J of its own form.
-Formerly each node was the body's or the water's, by half its volume; a held box felt 3 to 7 % too little buoyancy, four cells high, and 9 to 18 %,
-two cells high (``sim.validation.float_and_sink.buoyancy`` has today's). Weights above a node's share let nodes that water hardly
-reaches take up the push: a neutral box on 64 cells drifted up to twelve times as far in still water.
+and filled nodes get that motion. Linear and angular momentum are what they were, exactly (the normal equations), and energy can only
+fall (a projection). Were filled nodes left to themselves, nothing would hold the water out: each substep a node takes up the
+pressure's push, the body averages it away, and water flows in at about g dt H / dx, ten times too deep a draft. c and the rotation
+(a quaternion) then move the particles, whose places in the body never change. The moment of inertia of a lone body is
+I = sum_p m (|r|^2 1 - r r^T) and that of the quadratic B-splines, dx^2 / 4 along each axis. Two and three dimensions share the
+code: a 2D body is a 3D one that turns about z.
 
-Contact at a distance would hold water off, and sound rectify it: boxes floated a fifth of a cell too high. The gap is what half a cell's mass lacks
-at the point, a half-space of water having exactly a half there, closed in 1 / ``CLOSE`` substeps. At outer corners, with three quarters of
-the space water's, it is not seen. Drops weigh too little to be a contact; they and what slips through between points are put back on the
-face, inelastically, before every substep (``expel``).
-
-The moment of inertia is I = sum_p m (|r|^2 1 - r r^T) and that of the particles as cubes of edge h, h^2 / 12 along each axis: exact for a box.
-Two and three dimensions share the code: a 2D body is a 3D one that turns about z.
-
-Walls and obstacles act on the *body* too. Contacts are points: a particle, a ball half a spacing thick, against a wall, a signed distance or
-the faces of another body, u.n >= -gap / dt (inelastic; no approach beyond the gap), |J_t| <= mu J_n, solved with those of the grid by projected
-Gauss-Seidel (Catto 2005) with accumulated impulses. What rounding and rotation leave of a penetration into walls and obstacles is taken off by
-shifting the body; bodies that got into one another are not parted.
-Everywhere mu is the walls' coefficient, an obstacle's own on it.
+Decision: walls, obstacles and other bodies act on the *body*, not on its share of the grid. On the grid only the nodes behind a wall
+would be held, a tenth of a body's mass; each substep it would regain the weight that they took off, and creep down any slope
+at g dt times ten. Contacts are points: a particle, a ball half a spacing thick, against a wall, a signed distance or the
+faces of another body, u.n >= -gap / dt (inelastic; no approach beyond the gap), |J_t| <= mu J_n, solved by projected Gauss-Seidel
+(Catto 2005) with accumulated impulses. What rounding and rotation leave of a penetration is taken off by shifting the body.
+Between bodies contact is without friction: the grid, which they share within two cells of each other, already lets none slip.
 
 Positions and r are in cells, velocities in m/s, spin in 1/s, moments of inertia in kg cells^2. All vectors have three lanes.
 """
@@ -37,33 +31,18 @@ from sim.taichi_runtime import ti
 
 #: Sweeps of the contact solver at most, and the change of an impulse, relative to the largest, at which it is done. With 60 a stone on wood sank
 #: half a cell into it in ten seconds.
-SWEEPS, SETTLED = 300, 1e-3
+SWEEPS, SETTLED = 300, 1e-4
 #: Contacts are listed from this gap on [cells], in addition to a substep's way.
 NEAR = 0.1
-#: Distance from a wall, in cells, at which particles are stopped.
-HAIR = 1e-4
 #: Friction coefficient of sticky walls and obstacles.
 NO_SLIP = 1e9
-#: Stands for the second body of a contact with the grid.
-GRID = -2
-#: Over-relaxation of contacts with the grid, whose points overlap: half the sweeps. Energy falls with any below 2.
-OVER = 1.4
-#: A point of a face is a contact where the nodes around it have this share of a cell's mass.
-PRESENT = 0.02
-#: What that share loses a cell of gap, near 0.5 of no gap: the autocorrelation of the splines at 0.
-SLOPE = 0.55
-#: Share of a gap that water may close in a substep.
-CLOSE = 0.05
+#: Nodes filled by bodies to this share of a cell are theirs: 1/2 is a body's face.
+SOLID = 0.5 - 1e-3
 #: Squared speed that stands for contacts beyond the list's end: its frame is taken back and repeated with half the step, whose gaps close
 #: fewer, until the trajectory fails.
 OVERFLOW = 1e30
 #: Columns of the table that ``load`` takes, before the planes.
 COLUMNS = 24
-
-
-def contacts_at_most(capacity: int) -> int:
-    """Entries of the list of contacts."""
-    return max(capacity, 1 << 12)
 
 
 @ti.func
@@ -108,43 +87,35 @@ class RigidBodies:
     def __init__(self, kernels, capacity: int, planes: int, contacts: int):
         self.kernels, self.dim = kernels, kernels.dim
         self.capacity, self.planes_at_most = capacity, planes
-        self.water = ti.Vector.field(self.dim + 1, ti.f32, kernels.nodes)  # of a node at a face: velocity while contacts are solved, 1 / mass
+        self.share = ti.Vector.field(2, ti.f32, kernels.nodes)  # of a node: rigid mass, filled share of a cell
         self.rest = ti.Vector.field(self.dim, ti.f32, kernels.capacity)  # a particle's place in its body
         self.count, self.touching = ti.field(ti.i32, ()), ti.field(ti.i32, ())
         self.half = ti.field(ti.f32, ())  # half a particle spacing, cells
         self.span = ti.Vector.field(2, ti.i32, capacity)  # particles span[0] .. span[1]
         self.mass, self.reach, self.radius = (ti.field(ti.f32, capacity) for _ in range(3))  # kg a particle; cells; cells, 0 without
-        self.centre, self.velocity, self.spin = (ti.Vector.field(3, ti.f32, capacity) for _ in range(3))
+        self.centre = ti.Vector.field(3, ti.f32, capacity)
+        # In float64: a collision adds up hundreds of impulses, which in float32 cost 3e-5 of the momentum.
+        self.velocity, self.spin = (ti.Vector.field(3, ti.f64, capacity) for _ in range(2))
         self.turn = ti.Vector.field(4, ti.f32, capacity)
         self.inertia, self.inverse = ti.Matrix.field(3, 3, ti.f32, capacity), ti.Matrix.field(3, 3, ti.f32, capacity)  # in the body; in space
         self.rest_inverse = ti.Matrix.field(3, 3, ti.f32, capacity)
         self.state = [self.centre, self.velocity, self.spin, self.turn]
-        self.saved = [ti.Vector.field(field.n, ti.f32, capacity) for field in self.state]
+        self.saved = [ti.Vector.field(field.n, field.dtype, capacity) for field in self.state]
         self.planes = ti.Vector.field(4, ti.f32, (capacity, planes))  # outward normal, offset from the centre; in the body
         self.faces = ti.field(ti.i32, capacity)
         self.pair = ti.Vector.field(2, ti.i32, contacts)  # bodies; the second is -1 for what does not move
         self.at, self.normal = ti.Vector.field(3, ti.f32, contacts), ti.Vector.field(4, ti.f32, contacts)  # normal and least approach
         self.impulse = ti.Vector.field(4, ti.f32, contacts)  # impulse on the first body, friction coefficient
-        self.spot = ti.Vector.field(5, ti.f32, contacts)  # with the grid: place on the face, 1 / sum of the weights, softness
-
-    def motion(self) -> dict[str, np.ndarray]:
-        """Centres [cells], velocities [m/s], spins [1/s], each [bodies, 3], and unit quaternions "turn" [bodies, 4]."""
-        return {name: getattr(self, name).to_numpy() for name in ("centre", "velocity", "spin", "turn")}
-
-    def set_motion(self, motion: dict[str, np.ndarray]) -> None:
-        """Replace what ``motion`` gives; particles of the bodies follow in the next substep. For studies of bodies that are held or driven."""
-        for name, values in motion.items():
-            getattr(self, name).from_numpy(values)
 
     @staticmethod
     def sizes(dim: int, bodies: int, planes: int, capacity: int, nodes: int) -> dict[str, tuple[int, int]]:
         """Fields with more than a few entries: name -> (bytes an entry, entries), as ``MPMSimulator.plan`` lists them."""
-        rigid = {"span": 8, "mass": 4, "reach": 4, "radius": 4, "centre": 12, "velocity": 12, "spin": 12, "turn": 16, "inertia": 36, "inverse": 36,
-                 "rest inverse": 36, "faces": 4, "saved centre": 12, "saved velocity": 12, "saved spin": 12, "saved turn": 16}
-        contact = {"pair": 8, "at": 12, "normal": 16, "impulse": 16, "spot": 20}
+        rigid = {"span": 8, "mass": 4, "reach": 4, "radius": 4, "centre": 12, "velocity": 24, "spin": 24, "turn": 16, "inertia": 36, "inverse": 36,
+                 "rest inverse": 36, "faces": 4, "saved centre": 12, "saved velocity": 24, "saved spin": 24, "saved turn": 16}
+        contact = {"pair": 8, "at": 12, "normal": 16, "impulse": 16}
         return ({f"rigid {name}": (size, bodies) for name, size in rigid.items()} | {"rigid planes": (16, bodies * planes)}
-                | {"rigid rest": (4 * dim, capacity), "rigid water": (4 * dim + 4, nodes)}
-                | {f"contact {name}": (size, contacts_at_most(capacity)) for name, size in contact.items()})
+                | {"rigid rest": (4 * dim, capacity), "rigid share": (8, nodes)}
+                | {f"contact {name}": (size, capacity) for name, size in contact.items()})
 
     # -- set-up
     @ti.func
@@ -190,17 +161,19 @@ class RigidBodies:
     # -- one substep
     @ti.func
     def meet(self, dt):
-        """Gravity, and the contacts that the motion makes. ``solve`` follows, then ``advance``; all on one thread."""
+        """Motion from the grid's momenta, and the contacts that it makes. ``solve`` follows, then ``advance``; all on one thread."""
         for b in range(self.count[None]):
-            for d in ti.static(range(self.dim)):
-                self.velocity[b][d] += dt * self.kernels.pull[None][d]
+            self.fill(b)
+        for b in range(self.count[None]):
+            self.gather(b, dt)
         self.find_contacts(dt)
-        self.find_water(dt)
 
     @ti.func
     def advance(self, dt):
         """To the bodies' new places; returns the largest squared speed of a particle, one that no frame passes if contacts were too many to list."""
-        self.give()
+        for clear in ti.static((True, False)):
+            for b in range(self.count[None]):
+                self.carry(b, dt, clear)
         fastest = 0.0
         for b in range(self.count[None]):
             self.move(b, dt)
@@ -211,111 +184,82 @@ class RigidBodies:
         return fastest
 
     @ti.func
-    def node(self, base, fx, n):
-        """The n-th of the nodes around a place, and its weight."""
-        node, weight, rest = base, 1.0, n
+    def fill(self, b):
+        """Add a body's mass and volume to the nodes."""
+        volume = (2.0 * self.half[None]) ** self.dim
+        for p in range(self.span[b][0], self.span[b][1]):
+            base, fx = self.kernels.locate(self.kernels.x[p])
+            for n in range(3**self.dim):
+                node, weight, arm = self.node(b, base, fx, n)
+                self.share[node] += weight * ti.Vector([self.mass[b], volume])
+
+    @ti.func
+    def node(self, b, base, fx, n):
+        """The n-th of the nodes that a particle reaches, its weight, and its place from the body's centre [3]."""
+        node, weight, rest, arm = base, 1.0, n, -self.centre[b]
         for d in ti.static(range(self.dim)):
             k = rest % 3
             rest = rest // 3
             node[d] = base[d] + k
             weight *= self.kernels.weights(fx[d])[k]
-        return node, weight
+            arm[d] += ti.cast(node[d], ti.f32)
+        return node, weight, arm
 
     @ti.func
-    def flat(self, at):
-        """A place of three lanes as the grid takes it."""
-        x = ti.Vector.zero(ti.f32, self.dim)
+    def gather(self, b, dt):
+        """The nearest rigid motion. Sums are of differences from the old V, in float64: thousands of terms a body would cost momentum 5e-8
+        of itself a substep."""
+        old = self.velocity[b]
+        pull = ti.Vector.zero(ti.f32, 3)
         for d in ti.static(range(self.dim)):
-            x[d] = at[d]
-        return x
+            pull[d] = dt * self.kernels.pull[None][d]
+        M, P, L, S = ti.cast(0.0, ti.f64), ti.Vector.zero(ti.f64, 3), ti.Vector.zero(ti.f64, 3), ti.Vector.zero(ti.f64, 3)
+        second = ti.Matrix.zero(ti.f64, 3, 3)
+        for p in range(self.span[b][0], self.span[b][1]):
+            base, fx = self.kernels.locate(self.kernels.x[p])
+            for n in range(3**self.dim):
+                node, weight, arm = self.node(b, base, fx, n)
+                cell, share = self.kernels.grid[node], self.share[node]
+                mass, mu = ti.max(cell[self.dim], 1e-30), weight * self.mass[b]
+                if share[1] >= SOLID:
+                    mu *= ti.max(mass / share[0], 1.0)
+                v = pull - old
+                for d in ti.static(range(self.dim)):
+                    v[d] += cell[d] / mass
+                M += mu
+                P += mu * v
+                S += mu * arm
+                L += mu * arm.cross(v)
+                second += mu * arm.outer_product(arm)
+        # About the centroid of mu, the two sums part.
+        middle, mean = S / M, P / M
+        second -= M * middle.outer_product(middle)
+        inertia = second.trace() * ti.Matrix.identity(ti.f64, 3) - second
+        spin = inertia.inverse() @ (L - M * middle.cross(mean))
+        self.velocity[b] = ti.cast(old + mean - spin.cross(middle), ti.f32)
+        self.spin[b] = ti.cast(spin / self.kernels.dx[None], ti.f32)
 
     @ti.func
-    def find_water(self, dt):
-        """Contacts with the grid: the feet, on each face, of particles within a spacing of it. Where faces meet at an obtuse angle, feet beyond
-        the edge are none: with 48 sides, a body of half a cell more floated a fifth of its radius too high."""
-        cell = self.cell_mass()
-        half = self.half[None]
-        for b in range(self.count[None]):
-            R = rotation(self.turn[b])
-            round_ = self.radius[b] > 0.0
-            for p in range(self.span[b][0], self.span[b][1]):
-                X = lift(self.rest[p])
-                for k in range(ti.select(round_, 1, self.faces[b])):
-                    n, offset = ti.Vector([self.planes[b, k][0], self.planes[b, k][1], self.planes[b, k][2]]), self.planes[b, k][3]
-                    if round_:
-                        n = X / ti.max(X.norm(), 1e-6)
-                        offset = self.radius[b]
-                    beyond = X.dot(n) - offset
-                    if beyond > -2.0 * half:
-                        foot, on = X - beyond * n, True
-                        for other in range(self.faces[b]):
-                            plane = self.planes[b, other]
-                            on = on and foot.dot(ti.Vector([plane[0], plane[1], plane[2]])) - plane[3] < 1e-3
-                        if on:
-                            self.wet(b, self.centre[b] + R @ foot, -(R @ n), cell, dt)
+    def carry(self, b, dt, clear: ti.template()):
+        """Filled nodes move with the body: ``clear`` them of momentum, then give them the body's, in its share of their rigid mass.
 
-    @ti.func
-    def wet(self, b, at, normal, cell, dt):
-        """List a point of a face, ``normal`` into the body, as a contact with the grid, and note its nodes' velocities."""
-        base, fx = self.kernels.locate(self.flat(at))
-        total, mass, soft, moved = 0.0, 0.0, 0.0, ti.Vector.zero(ti.f32, 3)
-        for n in range(3**self.dim):
-            node, weight = self.node(base, fx, n)
-            m = self.kernels.grid[node][self.dim]
-            mass += weight * m
-            w = ti.min(weight, m / cell)
-            if m > 0.0:
-                total += w
-                soft += w * w / m
-                moved += w * lift(ti.cast(node, ti.f32))
-        if mass > PRESENT * cell:
-            k = ti.atomic_add(self.touching[None], 1)
-            if k < self.pair.shape[0]:
-                rough = self.kernels.coefficient[None] if ti.static(self.kernels.friction != "sticky") else NO_SLIP
-                self.pair[k] = ti.Vector([b, GRID])
-                self.at[k] = moved / total
-                gap = ti.max(0.5 - mass / cell, 0.0) / SLOPE
-                self.normal[k] = ti.Vector([normal[0], normal[1], normal[2], -CLOSE * gap * self.kernels.dx[None] / dt])
-                self.impulse[k] = ti.Vector([0.0, 0.0, 0.0, rough])
-                self.spot[k] = ti.Vector([at[0], at[1], at[2], 1.0 / total, soft / (total * total)])
-                for n in range(3**self.dim):
-                    node, weight = self.node(base, fx, n)
-                    value = self.kernels.grid[node]
-                    m = value[self.dim]
-                    if m > 0.0:
+        Gravity, which the nodes' update will add, is taken off first.
+        """
+        pull, dx = dt * self.kernels.pull[None], self.kernels.dx[None]
+        for p in range(self.span[b][0], self.span[b][1]):
+            base, fx = self.kernels.locate(self.kernels.x[p])
+            for n in range(3**self.dim):
+                node, weight, arm = self.node(b, base, fx, n)
+                share = self.share[node]
+                if share[1] >= SOLID:
+                    if ti.static(clear):
                         for d in ti.static(range(self.dim)):
-                            self.water[node][d] = value[d] / m + dt * self.kernels.pull[None][d]
-                        self.water[node][self.dim] = 1.0 / m
-
-    @ti.func
-    def share(self, k, n, cell):
-        """The n-th node of a contact with the grid, and its part in it; 0 without mass."""
-        base, fx = self.kernels.locate(self.flat(self.spot[k]))
-        node, weight = self.node(base, fx, n)
-        inverse = self.water[node][self.dim]
-        part = 0.0
-        if inverse > 0.0:
-            part = ti.min(weight, 1.0 / (inverse * cell)) * self.spot[k][3]
-        return node, part
-
-    @ti.func
-    def cell_mass(self):
-        """Of a full cell of the lightest material [kg]."""
-        cell = 1e30
-        for m in ti.static(self.kernels.flowing):
-            cell = ti.min(cell, self.kernels.mass_volume[m][0] / self.kernels.mass_volume[m][1])
-        return cell * self.kernels.dx[None] ** self.dim
-
-    @ti.func
-    def give(self):
-        """To the grid what its contacts took."""
-        cell = self.cell_mass()
-        for k in range(ti.min(self.touching[None], self.pair.shape[0])):
-            if self.pair[k][1] == GRID:
-                for n in range(3**self.dim):
-                    node, part = self.share(k, n, cell)
-                    for d in ti.static(range(self.dim)):
-                        self.kernels.grid[node][d] -= part * self.impulse[k][d]
+                            self.kernels.grid[node][d] = 0.0
+                    else:
+                        mu = weight * self.mass[b] * self.kernels.grid[node][self.dim] / share[0]
+                        u = self.velocity[b] + dx * self.spin[b].cross(arm)
+                        for d in ti.static(range(self.dim)):
+                            self.kernels.grid[node][d] += mu * (u[d] - pull[d])
 
     @ti.func
     def touch(self, b, other, at, normal, gap, friction, dt):
@@ -333,57 +277,8 @@ class RigidBodies:
                 self.impulse[k] = ti.Vector([0.0, 0.0, 0.0, friction])
 
     @ti.func
-    def outside(self, b, at):
-        """Signed distance [cells] of a place from a body's surface, and the outward normal there."""
-        R = rotation(self.turn[b])
-        X = R.transpose() @ (at - self.centre[b])
-        length = X.norm()
-        distance, normal = length - self.radius[b], X / ti.max(length, 1e-6)
-        if self.radius[b] <= 0.0:
-            distance = -1e9
-            for k in range(self.faces[b]):
-                n = ti.Vector([self.planes[b, k][0], self.planes[b, k][1], self.planes[b, k][2]])
-                beyond = n.dot(X) - self.planes[b, k][3]
-                if beyond > distance:
-                    distance = beyond
-                    normal = n
-        return distance, R @ normal
-
-    @ti.func
-    def expel(self, p, mass):
-        """A particle that got into a body goes to its surface and, inelastically, on with it; the body takes what that changes of its momentum."""
-        x = self.kernels.x[p]
-        at = lift(x)
-        for b in range(self.count[None]):
-            if (at - self.centre[b]).norm() < self.reach[b] + 1.0:
-                distance, normal = self.outside(b, at)
-                if distance < 0.0:
-                    u = self.point_velocity(b, at)
-                    approach = 0.0
-                    for d in ti.static(range(self.dim)):
-                        approach += normal[d] * (self.kernels.v[p][d] - u[d])
-                        low, high = ti.cast(self.kernels.extent[0][d], ti.f32) + HAIR, ti.cast(self.kernels.extent[1][d], ti.f32) - HAIR
-                        self.kernels.x[p][d] = ti.min(ti.max(x[d] - distance * normal[d], low), high)
-                    if approach < 0.0:
-                        arm, own = (at - self.centre[b]).cross(normal), 1.0 / self.weight(b)
-                        J = approach / (1.0 / mass + own + arm.dot(self.inverse[b] @ arm)) * normal
-                        self.velocity[b] += own * J
-                        self.spin[b] += self.inverse[b] @ (at - self.centre[b]).cross(J) / self.kernels.dx[None]
-                        for d in ti.static(range(self.dim)):
-                            self.kernels.v[p][d] -= J[d] / mass
-
-    @ti.func
-    def weight(self, b):
-        """Mass of a body [kg]."""
-        return self.mass[b] * ti.cast(self.span[b][1] - self.span[b][0], ti.f32)
-
-    @ti.func
     def find_contacts(self, dt):
         half = self.half[None]
-        # Where there is something that flows, walls and obstacles stop bodies a particle's width off: room for it to get under, and push.
-        film = half
-        if ti.static(len(self.kernels.flowing) > 0):
-            film = 3.0 * half
         self.touching[None] = 0
         for b in range(self.count[None]):
             for p in range(self.span[b][0], self.span[b][1]):
@@ -394,18 +289,30 @@ class RigidBodies:
                     axis, side = face // 2, face % 2
                     inward = ti.Vector.zero(ti.f32, 3)
                     inward[axis] = 1.0 - 2.0 * side
-                    gap = (x[axis] - ti.cast(self.kernels.extent[side][axis], ti.f32)) * inward[axis] - film
+                    gap = (x[axis] - ti.cast(self.kernels.extent[side][axis], ti.f32)) * inward[axis] - half
                     rough = self.kernels.coefficient[None] if ti.static(self.kernels.friction != "sticky") else NO_SLIP
                     self.touch(b, -1, at, inward, gap, rough, dt)
                 if ti.static(self.kernels.structure.obstacles != "none"):
                     clear, out = self.kernels.clearance(x)
                     friction = self.kernels.solids[ti.cast(x + 0.5, ti.i32)][self.dim + 1]
-                    self.touch(b, -1, at, lift(out), clear - film, friction if friction >= 0.0 else NO_SLIP, dt)
-                rough = self.kernels.coefficient[None] if ti.static(self.kernels.friction != "sticky") else NO_SLIP
+                    self.touch(b, -1, at, lift(out), clear - half, friction if friction >= 0.0 else NO_SLIP, dt)
                 for other in range(self.count[None]):
                     if other != b and (at - self.centre[other]).norm() < self.reach[other] + half + 1.0:
-                        distance, normal = self.outside(other, at)
-                        self.touch(b, other, at, normal, distance - half, rough, dt)
+                        R = rotation(self.turn[other])
+                        inside = R.transpose() @ (at - self.centre[other])
+                        distance, normal = -1e9, ti.Vector([0.0, 1.0, 0.0])
+                        for k in range(self.faces[other]):
+                            plane = self.planes[other, k]
+                            beyond = plane[0] * inside[0] + plane[1] * inside[1] + plane[2] * inside[2] - plane[3]
+                            if beyond > distance:
+                                distance = beyond
+                                normal = ti.Vector([plane[0], plane[1], plane[2]])
+                        length = inside.norm()
+                        radial = inside / ti.max(length, 1e-6)
+                        if self.radius[other] > 0.0:
+                            distance = length - self.radius[other]
+                            normal = radial
+                        self.touch(b, other, at, R @ normal, distance - half, 0.0, dt)
 
     @ti.func
     def point_velocity(self, b, at):
@@ -418,12 +325,6 @@ class RigidBodies:
         u = self.point_velocity(a, self.at[k])
         if b >= 0:
             u -= self.point_velocity(b, self.at[k])
-        elif b == GRID:
-            cell = self.cell_mass()
-            for n in range(3**self.dim):
-                node, part = self.share(k, n, cell)
-                for d in ti.static(range(self.dim)):
-                    u[d] -= part * self.water[node][d]
         return u
 
     @ti.func
@@ -434,9 +335,7 @@ class RigidBodies:
             b = self.pair[k][side]
             if b >= 0:
                 arm = (self.at[k] - self.centre[b]).cross(n)
-                total += 1.0 / self.weight(b) + arm.dot(self.inverse[b] @ arm)
-        if self.pair[k][1] == GRID:
-            total += self.spot[k][4]
+                total += 1.0 / (self.mass[b] * ti.cast(self.span[b][1] - self.span[b][0], ti.f32)) + arm.dot(self.inverse[b] @ arm)
         return total
 
     @ti.func
@@ -445,14 +344,8 @@ class RigidBodies:
         for side in ti.static(range(2)):
             b, sign = self.pair[k][side], ti.static(1.0 - 2.0 * side)
             if b >= 0:
-                self.velocity[b] += sign * J / self.weight(b)
+                self.velocity[b] += sign * J / (self.mass[b] * ti.cast(self.span[b][1] - self.span[b][0], ti.f32))
                 self.spin[b] += sign * (self.inverse[b] @ (self.at[k] - self.centre[b]).cross(J)) / self.kernels.dx[None]
-        if self.pair[k][1] == GRID:
-            cell = self.cell_mass()
-            for n in range(3**self.dim):
-                node, part = self.share(k, n, cell)
-                for d in ti.static(range(self.dim)):
-                    self.water[node][d] -= part * self.water[node][self.dim] * J[d]
 
     @ti.func
     def solve(self):
@@ -466,8 +359,7 @@ class RigidBodies:
                 total = ti.Vector([self.impulse[k][0], self.impulse[k][1], self.impulse[k][2]])
                 pressed = total.dot(n)
                 u = self.slip(k)
-                relax = OVER if self.pair[k][1] == GRID else 1.0
-                now = ti.max(pressed + relax * (self.normal[k][3] - u.dot(n)) / self.softness(k, n), 0.0)
+                now = ti.max(pressed + (self.normal[k][3] - u.dot(n)) / self.softness(k, n), 0.0)
                 self.push(k, (now - pressed) * n)
                 held, friction = total - pressed * n, self.impulse[k][3]
                 rubbed = held
@@ -565,7 +457,7 @@ def body_table(scene: Scene, particles, cell: np.ndarray, dx: float, wall: int, 
         centre[:dim] = cell[members].mean(0)
         arm = np.zeros((len(members), 3))
         arm[:, :dim] = cell[members] - centre[:dim]
-        second = mass * (arm.T @ arm + len(members) * np.diag([(particles.spacing / dx) ** 2 / 12] * dim + [0.0] * (3 - dim)))
+        second = mass * (arm.T @ arm + len(members) * np.diag([0.25] * dim + [0.0] * (3 - dim)))
         faces = np.zeros((0, dim + 1))
         if body.kind == "polygon":
             faces = ConvexHull(body.vertices).equations

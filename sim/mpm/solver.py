@@ -17,7 +17,7 @@ import numpy as np
 from sim.errors import InputError
 from sim.mpm.decomposition import finite
 from sim.mpm.materials import MODELS
-from sim.mpm.rigid import RigidBodies, body_table, contacts_at_most
+from sim.mpm.rigid import RigidBodies, body_table
 from sim.mpm.walls import solid, wall
 from sim.obstacles import THINNEST, combine
 from sim.scene import Particles, Scene
@@ -122,7 +122,7 @@ class _Kernels:
             ti.field(ti.f32, capacity) if isinstance(field, ti.ScalarField) else ti.Vector.field(field.n, ti.f32, capacity) for field in self.state
         ]
         self.has_rigid = structure.rigid is not None
-        self.rigid = RigidBodies(self, *structure.rigid, contacts_at_most(capacity)) if self.has_rigid else None
+        self.rigid = RigidBodies(self, *structure.rigid, capacity) if self.has_rigid else None
         if self.has_rigid:
             self.touched = ti.Vector.field(dim, ti.i32, 2)  # lowest and highest first node of a particle
         self.frame = (self.frame_rigid if self.has_rigid else self.frame_serial) if serial else self.frame_parallel
@@ -469,9 +469,9 @@ class _Kernels:
             speed2 += self.v[p][d] ** 2
             height -= self.gravity[None][d] * x
         if ti.static(self.models[m][0] == "rigid"):
-            # The particle turns as a cube of the body: h^2 / 12 = half^2 / 3.
+            # A body's inertia includes the splines' own moments; its energy does too.
             for a in ti.static(range(self.dim)):
-                speed2 += self.rigid.half[None] ** 2 / 3.0 * (self.dx[None] * self.C[a][p]).norm_sqr()
+                speed2 += 0.25 * (self.dx[None] * self.C[a][p]).norm_sqr()
         sums[f, 0] += ti.cast(0.5 * mass * speed2, ti.f64)
         sums[f, 1] += ti.cast(mass * height, ti.f64)
         sums[f, 2] += ti.cast(volume * self.materials[m].energy_density(p), ti.f64)
@@ -486,7 +486,7 @@ class _Kernels:
     def spread(self, dt):
         """Particles to grid; returns the lowest and highest first node of a particle."""
         low, high = ti.Vector([1 << 20] * self.dim), ti.Vector([0] * self.dim)
-        for m in ti.static(self.flowing):
+        for m in ti.static(range(len(self.models))):
             for p in range(self.range[m], self.range[m + 1]):
                 base, fx = self.locate(self.x[p])
                 low, high = ti.min(low, base), ti.max(high, base)
@@ -497,7 +497,7 @@ class _Kernels:
     def clear(self, I):
         self.grid[I] = ti.Vector.zero(ti.f32, 4)
         if ti.static(self.has_rigid):
-            self.rigid.water[I] = ti.Vector.zero(ti.f32, self.dim + 1)
+            self.rigid.share[I] = ti.Vector.zero(ti.f32, 2)
 
     @ti.func
     def collect(self, low, high, dt):
@@ -556,14 +556,13 @@ class _Kernels:
                     self.report(m, p, f, position, sums)
 
     def frame_rigid(self, frames, substeps, dt, keep, position, sums) -> None:
-        """The same with rigid bodies, in six kernels a substep: all in one took 18 s to compile."""
+        """The same with rigid bodies, in five kernels a substep: all in one took 18 s to compile."""
         if keep:
             self.save(sums)
             self.keep_rigid(False)
         for f in range(0 if sums[0, 7] else frames):
             row = sums[f : f + 1]
             for _ in range(substeps):
-                self.expel_rigid()
                 self.spread_serial(dt, row)
                 self.step_rigid(dt, row)
                 self.collect_serial(dt, row)
@@ -576,12 +575,6 @@ class _Kernels:
         ti.loop_config(serialize=True)
         for _ in range(1):
             self.touched[0], self.touched[1] = self.spread(dt)
-
-    @ti.kernel
-    def expel_rigid(self):
-        for m in ti.static(self.flowing):
-            for p in range(self.range[m], self.range[m + 1]):
-                self.rigid.expel(p, self.mass_volume[m][0])
 
     @ti.kernel
     def meet_rigid(self, dt: ti.f32):
@@ -614,7 +607,7 @@ class _Kernels:
             sums[0, 5] = ti.max(sums[0, 5], ti.cast(self.collect(self.touched[0], self.touched[1], dt), ti.f64))
 
     def frame_parallel(self, frames, substeps, dt, keep, position, sums) -> None:
-        """The same, two kernels a substep (six with rigid bodies), loops over particles and nodes parallel (for a GPU)."""
+        """The same, two kernels a substep (five with rigid bodies), loops over particles and nodes parallel (for a GPU)."""
         if keep:
             self.save(sums)
             if self.has_rigid:
@@ -622,8 +615,6 @@ class _Kernels:
         for f in range(0 if sums[0, 7] else frames):
             row = sums[f : f + 1]
             for _ in range(substeps):
-                if self.has_rigid:
-                    self.expel_rigid()
                 self.spread_parallel(dt, row)
                 if self.has_rigid:
                     self.step_rigid(dt, row)
@@ -634,7 +625,7 @@ class _Kernels:
     def spread_parallel(self, dt: ti.f32, sums: ti.types.ndarray(ti.f64, 2)):
         if ti.static(self.structure.shaken):
             self.shake(0, sums)
-        for m in ti.static(self.flowing):
+        for m in ti.static(range(len(self.models))):
             for p in range(self.range[m], self.range[m + 1]):
                 base, fx = self.locate(self.x[p])
                 self.p2g(m, p, base, fx, dt)
@@ -1053,8 +1044,8 @@ class MPMSimulator:
         else:
             fields |= RigidBodies.sizes(dim, *structure.rigid, n, nodes)
             kernels.remove("frame_serial")
-            kernels += ["save", "expel_rigid", "spread_serial", "meet_rigid", "solve_rigid", "move_rigid", "collect_serial", "report_parallel",
-                        "load_rigid", "keep_rigid"]
+            kernels += ["save", "spread_serial", "meet_rigid", "solve_rigid", "move_rigid", "collect_serial", "report_parallel", "load_rigid",
+                        "keep_rigid"]
         gravity = float(np.linalg.norm(np.array(scene.gravity) - scene.acceleration(), axis=1).max())
         start = float(np.sqrt((particles.velocity**2).sum(1).max()))
         fall = float(np.sqrt(start**2 + 2 * gravity * np.linalg.norm(upper - lower)))
@@ -1176,11 +1167,6 @@ class MPMSimulator:
         lanes[:n, :dim], lanes[:n, dim] = velocity, 1.0
         kernels.v.from_numpy(lanes)
         self._run(0, 0.0, keep=True)
-
-    @property
-    def rigid(self) -> RigidBodies:
-        """The rigid bodies of the loaded scene, in the order of its bodies."""
-        return self._kernels.rigid
 
     def inject(self, name: str, particle: int, value) -> None:
         """Overwrite what ``state`` gives for one particle under a name (a material's: counted within it), positions in cells. For studies of

@@ -6,7 +6,7 @@ import pytest
 from sim.mpm.solver import MPMSimulator
 from sim.scene import Scene
 from sim.validation.block_on_plane import block_on_plane
-from sim.validation.float_and_sink import HEIGHT, buoyancy, float_and_sink, pool_scene
+from sim.validation.float_and_sink import HEIGHT, float_and_sink, pool_scene
 
 pytestmark = pytest.mark.physics
 
@@ -36,13 +36,6 @@ def test_a_block_sticks_where_friction_is_enough(block, angle, friction):
 def test_a_light_box_floats_at_its_draft(pool):
     found = float_and_sink(0.5, 0.4375, cells=32, seconds=2.5, simulator=pool)
     assert found["error"] <= 0.05, found
-
-
-@pytest.mark.parametrize("phase", [0.0, 1 / 4, 1 / 2, 3 / 4])
-def test_buoyancy_wherever_the_faces_are_between_nodes(pool, phase):
-    """On a box two cells high."""
-    found = buoyancy(phase, cells=16, simulator=pool)
-    assert abs(found["error"]) <= 0.05, found
 
 
 def test_a_neutral_box_stays(pool):
