@@ -161,10 +161,10 @@ static inline void gather(Grid grid, const Setting *s, float dt, float *x, float
     }
 }
 
-/* exp(g) to g^5 / 720; nothing of a volume that so much as doubles, or is turned inside out, in a step. */
+/* exp(g) to g^5 / 720; nothing of a volume that changes too much in a step. */
 static float exponential(float g) {
     const float even = 12.0f + g * g;
-    return fabsf(g) < 1.0f ? (even + 6.0f * g) / (even - 6.0f * g) : 0.0f;
+    return fabsf(g) < 0.5f ? (even + 6.0f * g) / (even - 6.0f * g) : 0.0f;
 }
 
 /* Water: p = stiffness (J^-7 - 1), stiffness = rho0 c^2 / 7; tau = -J p I; J <- J exp(dt tr C). */
