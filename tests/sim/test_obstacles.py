@@ -328,7 +328,7 @@ def test_columns_of_a_slope_take_turns():
 def test_columns_face_outwards(content):
     """In a notch too, whose nearest surface may be the other side's; and the arithmetic warns of nothing."""
     with np.errstate(all="raise"):
-        found = columns(content)
+        found = columns(content, cells=12)
     across = [np.dot(row[:2], row[3:5]) for row in found.values() if any(row[:2]) and row[2] >= 0]
     assert len(across) > 6 and min(across) > 0.5
 
@@ -337,12 +337,19 @@ def test_thin_plates_hold_their_nodes():
     found = columns({"kind": "segment", "start": [-5.0, 3.0], "end": [15.0, 3.0], "thickness": 1.6})
     # One line for both faces.
     assert found == {(i, 4): [0, 1, -1, 0, 1, 0.25, 1] for i in range(11)}
-    thick = columns({"kind": "segment", "start": [-5.0, 3.0], "end": [15.0, 3.0], "thickness": 3.2})
-    # Faces between nodes 2 and 3, 5 and 6: 0.4 cells beyond the outer ones. The node in the middle is out of reach, either's.
-    up, down = thick[4, 6], thick[4, 2]
+    thick = columns({"kind": "segment", "start": [-5.0, 5.0], "end": [15.0, 5.0], "thickness": 3.2}, cells=12)
+    # Faces between nodes 4 and 5, 7 and 8: 0.4 cells beyond the outer ones. The node in the middle is out of reach, either's.
+    up, down = thick[4, 8], thick[4, 4]
     assert up[:2] == [0, 1] and down[:2] == [0, -1] and up[2] + down[2] == 3
     assert up[3:] == [0, 1, 0.25, pytest.approx(1.4)] and down[3:] == [0, -1, 0.25, pytest.approx(1.4)]
-    assert set(thick) == {(i, j) for i in range(11) for j in (2, 6)}
+    assert set(thick) == {(i, j) for i in range(15) for j in (4, 8)}
+
+
+def test_no_column_takes_its_velocity_from_a_wall():
+    """A face 0.7 cells from a wall: its column's next node would be the wall's own, so the one at the face is held. Farther off it is not."""
+    near = columns({"kind": "halfspace", "point": [7.3, 0.0], "normal": [1.0, 0.0]})
+    far = columns({"kind": "halfspace", "point": [6.3, 0.0], "normal": [1.0, 0.0]})
+    assert all(near[8, j][:3] == [0, 0, 0] for j in range(11)) and all(far[7, j][:3] == [1, 0, 3] for j in range(11))
 
 
 PLATE = {"kind": "segment", "start": [-0.2, 0.5], "end": [1.2, 0.4], "thickness": THINNEST / 16}
