@@ -79,8 +79,9 @@ def test_kill_9_at_twenty_instants(tmp_path):
     assert process.returncode == 0 and len(expected) == 16 and shards(tmp_path / "warm") == expected
     rng, stages, chains, pace = np.random.default_rng(20), [], 1, 1.0
     while len(stages) < 20:
-        left = 1 - len(shards(folder)) / 16
-        instant = pace * (rng.uniform(0, first) if len(stages) % 4 == 0 else first + rng.uniform(0, working) * left)
+        before = len(shards(folder))
+        left, early = 1 - before / 16, len(stages) % 4 == 0
+        instant = pace * (rng.uniform(0, first) if early else first + rng.uniform(0, working) * left)
         process = start(folder)
         try:
             assert process.wait(timeout=instant) == 0
@@ -89,6 +90,8 @@ def test_kill_9_at_twenty_instants(tmp_path):
             process.wait()
             present = shards(folder)
             stages.append(len(present))
+            if not early and len(present) == before:
+                pace = min(1.3 * pace, 2.0)
             assert present.items() <= expected.items(), "what is there is finished, to the last byte"
         else:
             assert shards(folder) == expected and without_cost(folder) == content and not hidden(folder)
