@@ -10,7 +10,7 @@ from pathlib import Path
 from PIL import Image
 
 from sim.errors import InputError
-from sim.generate import mpm_teacher, simulate, trajectory_seed
+from sim.generate import scene_teacher, simulate, trajectory_seed
 from sim.paper import DOMAINS
 from sim.render import render_strip
 from sim.scene import SceneFamily
@@ -53,9 +53,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not paths:
         print(InputError("sluice gallery", "scenes", str(options.scenes), "holds no scene of a domain"), file=sys.stderr)
         return 2
-    teacher, sections = mpm_teacher(), []
+    teachers, sections = {}, []
     for path in sorted(paths):
-        trajectory = simulate(teacher, SceneFamily.load(path).sample(trajectory_seed(0, "test", 0), "test"))
+        scene = SceneFamily.load(path).sample(trajectory_seed(0, "test", 0), "test")
+        method = scene.solver.method
+        teacher = teachers[method] = teachers.get(method) or scene_teacher(method)
+        trajectory = simulate(teacher, scene)
         name = path.stem
         picture = options.out / "gallery" / f"{name}.png"
         render_strip(picture, trajectory, width=options.width)

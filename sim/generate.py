@@ -23,6 +23,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from functools import partial
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Protocol
@@ -35,6 +36,7 @@ from sim import __version__
 from sim.errors import InputError, RunError
 from sim.scene import SPLITS, Scene, SceneFamily
 from sim.simulator import SimulationError
+from sim.solvers import solver_class
 from sim.trajectory import FORMAT_VERSION, ShardReader, Trajectory, write_json, write_shard
 
 DEFAULT_SHARD_SIZE = 8
@@ -63,11 +65,9 @@ class Teacher(Protocol):
         """Energies, substeps, ... of the current frame."""
 
 
-def mpm_teacher() -> Teacher:
-    """The scene's own solver at the scene's own settings. Imports Taichi, so only a worker calls it."""
-    from sim.mpm.solver import MPMSimulator
-
-    return MPMSimulator()
+def scene_teacher(method: str) -> Teacher:
+    """The solver of a scene's ``solver.method`` at the scene's own settings. Imports Taichi, so only a worker calls it."""
+    return solver_class(method)()
 
 
 def trajectory_seed(seed: int, split: str, index: int) -> int:
@@ -136,17 +136,18 @@ def generate(
     jobs: int = 1,
     seed: int = 0,
     shard_size: int = DEFAULT_SHARD_SIZE,
-    teacher: Callable[[], Teacher] = mpm_teacher,
+    teacher: Callable[[], Teacher] | None = None,
 ) -> dict:
     """Make trajectories 0 .. counts[split] - 1 of each split under ``out`` and return the content of ``dataset.json``.
 
     Finished shards of an earlier run with the same family and seed are checked and kept; a larger count extends a split.
-    ``teacher`` is called once in each of the ``jobs`` worker processes, so it must be importable. Raises ``InputError``
-    before anything is written (a scene that cannot be sampled, a folder made with other settings, an unwritable folder)
-    and ``RunError`` where the run itself fails (a worker killed, disk full, every trajectory of a split failed); what is
+    ``teacher`` (default: the scene's own solver) is called once in each of the ``jobs`` worker processes, so it must be
+    importable. Raises ``InputError`` before anything is written (a scene that cannot be sampled, a folder made with other
+    settings, an unwritable folder) and ``RunError`` where the run itself fails (a worker killed, disk full, every trajectory of a split failed); what is
     finished by then stays, and the same call continues from there.
     """
     out = Path(out)
+    teacher = teacher or partial(scene_teacher, family.model.solver.method)
     settings = {"family": family.to_dict(), "seed": seed, "shard_size": shard_size}
     shards = {split: _plan_shards(family, split, count, seed, shard_size) for split, count in counts.items()}
     content = _existing(out, settings)

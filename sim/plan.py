@@ -9,6 +9,7 @@ import numpy as np
 from sim.errors import InputError
 from sim.generate import SPLITS, trajectory_seed
 from sim.scene import SceneFamily
+from sim.solvers import solver_class
 
 #: Particle-substeps per second of one core, by dimension and the slowest material present, on a quiet AMD EPYC with AVX-512. Sand as
 #: ``make bench`` measures it (2D: 11.5-13 million for 1k to 20k particles; 3D: 2.7), and 3D water (15). 2D water as WATERDROP takes it
@@ -42,9 +43,8 @@ class Plan:
 
 def plan(family: SceneFamily) -> Plan:
     """Draw a few scenes and ask the solver what it would build. Raises ``InputError``; allocates and compiles nothing."""
-    from sim.mpm.solver import MPMSimulator
-
-    solver, model = MPMSimulator(), family.model
+    model = family.model
+    solver = solver_class(model.solver.method)()
     scenes = [family.sample(trajectory_seed(0, "train", index)) for index in range(_SAMPLES)]
     for scene in scenes:
         solver.check_time_step(scene, family.where)
@@ -61,12 +61,11 @@ def plan(family: SceneFamily) -> Plan:
 
 def check_time_step(family: SceneFamily, counts: dict[str, int], seed: int) -> None:
     """Refuse a fixed time step that is above the limit at the start of any of these trajectories. Raises ``InputError``."""
-    from sim.mpm.solver import MPMSimulator
-
     if family.model.time_step is not None:
+        solver = solver_class(family.model.solver.method)()
         for split, count in counts.items():
             for index in range(count):
-                MPMSimulator().check_time_step(family.sample(trajectory_seed(seed, split, index), split), family.where)
+                solver.check_time_step(family.sample(trajectory_seed(seed, split, index), split), family.where)
 
 
 def check_budget(family: SceneFamily, trajectories: int, budget: float) -> None:

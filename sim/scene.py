@@ -57,11 +57,12 @@ _PoissonRatio = Annotated[Finite, _only(0, 0.5, "must lie in 0 .. 0.4999: at 1/2
 class Water(_Strict):
     """Weakly compressible water, Tait pressure p = (rho0 c^2 / gamma) (J^-gamma - 1) (Batchelor 1967; Monaghan 1994, eq. 3).
 
-    viscosity [Pa s]: dynamic, at reference density."""
+    viscosity [Pa s]: dynamic, at reference density. An incompressible solver (``Incompressible``) has no use for the speed of sound [m/s]; the
+    others need it."""
 
     model: Literal["water"]
     density: Positive = 1000.0
-    sound_speed: Positive
+    sound_speed: Positive | None = None
     gamma: Annotated[float, Field(ge=1, le=10)] = 7.0
     viscosity: _Resistance = 0.0
 
@@ -159,10 +160,61 @@ class BodyFamily(_Strict):
     velocity: list[Range] | None = None
 
 
+#: A face of the box: axis and side, as in ``y-`` for the floor of a 2D scene.
+Face = Literal["x-", "x+", "y-", "y+", "z-", "z+"]
+
+
 class Walls(_Strict):
-    """Separating walls with Coulomb friction: 0 is free slip, ``sticky`` holds everything that touches."""
+    """Separating walls with Coulomb friction: 0 is free slip, ``sticky`` holds everything that touches.
+
+    velocity [m/s]: of walls that slide in their own plane and, being sticky, drag water along (SPH)."""
 
     friction: Friction = 0.0
+    velocity: dict[Face, list[Finite]] = {}
+
+    @model_serializer(mode="wrap")
+    def _without_what_is_absent(self, handler) -> dict:
+        content = handler(self)
+        return content if content.get("velocity") else {key: value for key, value in content.items() if key != "velocity"}
+
+
+class MaterialPoints(_Strict):
+    """MLS-MPM, the default (``sim.mpm``)."""
+
+    method: Literal["mpm"]
+
+
+#: Radius of the SPH kernel, in particle spacings.
+_Support = Annotated[Finite, _only(1.5, 4.0, "must lie in 1.5 .. 4 particle spacings: below it neighbours are missed, above it the kernel smears")]
+
+
+class WeaklyCompressible(_Strict):
+    """Weakly compressible SPH (``sim.sph.wcsph``).
+
+    support [particle spacings]; artificial_viscosity: Monaghan's alpha; density_diffusion: delta; shifting: particles are kept evenly spread."""
+
+    method: Literal["wcsph"]
+    support: _Support = 2.5
+    artificial_viscosity: Annotated[float, Field(ge=0, le=1)] = 0.02
+    density_diffusion: Annotated[float, Field(ge=0, le=1)] = 0.1
+    shifting: bool = True
+
+
+class Incompressible(_Strict):
+    """Divergence-free SPH (``sim.sph.dfsph``).
+
+    support [particle spacings]; density_error, divergence_error: mean error at which a solve ends, relative density (over a step);
+    iterations of a solve at most; xsph: share of the neighbours' mean velocity that a particle takes on in every step."""
+
+    method: Literal["dfsph"]
+    support: _Support = 2.0
+    density_error: Annotated[float, Field(gt=0, le=0.1)] = 5e-4
+    divergence_error: Annotated[float, Field(gt=0, le=0.1)] = 1e-3
+    iterations: Annotated[int, Field(ge=1, le=10_000)] = 100
+    xsph: Annotated[float, Field(ge=0, lt=1)] = 0.0
+
+
+Solver = Annotated[MaterialPoints | WeaklyCompressible | Incompressible, Field(discriminator="method")]
 
 
 class Splits(_Strict):
@@ -189,15 +241,21 @@ class _Physics(_Strict):
     #: Fixed length of a substep [s], for runs that must share one; absent: as long as the limits allow, frame by frame.
     time_step: Positive | None = None
     walls: Walls = Walls()
+    solver: Solver = MaterialPoints(method="mpm")
+    #: Axes along which the box repeats itself ("x", ...), without walls there (SPH).
+    periodic: list[Literal["x", "y", "z"]] = []
     materials: dict[str, Material]
     #: Material numbers ("material.key") that every frame's context repeats, after the container's acceleration if there is one.
     context: list[str] = []
 
     @model_serializer(mode="wrap")
     def _without_what_is_absent(self, handler) -> dict:
-        """A scene without time step, obstacles, container or context reads as if there were no such thing."""
+        """A scene without time step, obstacles, container, periodic axis or context, for the default solver, reads as if there were no such thing."""
         content = handler(self)
-        return {key: value for key, value in content.items() if key not in ("time_step", "obstacles", "container", "context") or value}
+        absent = {key for key in ("time_step", "obstacles", "container", "context", "periodic") if not content.get(key)}
+        if self.solver.method == "mpm":
+            absent.add("solver")
+        return {key: value for key, value in content.items() if key not in absent}
 
     @property
     def grid_spacing(self) -> float:
@@ -235,11 +293,39 @@ class _Physics(_Strict):
             if self.dim == 3 and isinstance(material, Sand) and material.friction_angle > 36.9:
                 remedy = "a compression-matched Drucker-Prager cone cannot yield in triaxial extension above 36.9 degrees in 3D; use less"
                 raise _mistake(f"materials.{name}.friction_angle", material.friction_angle, remedy)
+        self._check_solver()
         for index, entry in enumerate(self.context):
             name, _, key = entry.partition(".")
             if not isinstance(getattr(self.materials.get(name), key, None), float):
                 raise _mistake(f"context[{index}]", entry, "must be material.key with a number in it, as in sand.friction_angle")
         return self
+
+
+    def _check_solver(self) -> None:
+        """What the chosen solver cannot do, or needs."""
+        method = self.solver.method
+        axes = "xyz"[: self.dim]
+        for index, axis in enumerate(self.periodic):
+            if method == "mpm" or axis not in axes or axis in self.periodic[:index]:
+                remedy = f"must name each of {list(axes)} at most once"
+                if method == "mpm":
+                    remedy = "MPM has no periodic boxes; choose solver.method wcsph or dfsph"
+                raise _mistake(f"periodic[{index}]", axis, remedy)
+        for face, velocity in self.walls.velocity.items():
+            axis = "xyz".index(face[0])
+            where = f"walls.velocity.{face}"
+            if method == "mpm" or self.walls.friction != "sticky":
+                remedy = "only sticky walls of SPH scenes drag water along; set walls.friction: sticky and solver.method wcsph or dfsph"
+                raise _mistake(where, velocity, remedy)
+            if axis >= self.dim or face[0] in self.periodic or len(velocity) != self.dim or velocity[axis] != 0:
+                raise _mistake(where, velocity, f"must be the velocity of a wall of this box, {self.dim} entries, none through the wall itself")
+        if method != "mpm" and self.walls.friction not in (0, "sticky"):
+            raise _mistake("walls.friction", self.walls.friction, "SPH walls slip (0) or hold viscous water (sticky); MPM has Coulomb friction")
+        for name, material in self.materials.items():
+            if method != "mpm" and material.model not in ("water", "rigid"):
+                raise _mistake(f"materials.{name}.model", material.model, "SPH moves water and rigid bodies; MPM (leave solver out) all materials")
+            if method in ("mpm", "wcsph") and isinstance(material, Water) and material.sound_speed is None:
+                raise _mistake(f"materials.{name}.sound_speed", None, f"missing, and {method} needs it: at least ten times the largest speed")
 
 
 class _FamilyModel(_Physics):

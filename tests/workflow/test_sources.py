@@ -10,7 +10,7 @@ from workflow.sources import closure, registered_models
 
 #: What a job does, as far as it decides what is imported.
 PROGRAMS = {
-    "sim.generate": "import sim.generate; sim.generate.mpm_teacher()",
+    "sim.generate": "import sim.generate; [sim.generate.scene_teacher(method) for method in ('mpm', 'dfsph')]",
     "learn.train": "import learn.train",
     "workflow.scripts.errors": "import workflow.scripts.errors",
     "workflow.scripts.timing": "import workflow.scripts.timing",

@@ -1,0 +1,189 @@
+"""Divergence-free SPH (Bender & Koschier 2015, 2017): pressures that keep the velocity free of divergence and the density at rest density.
+
+With volumes V = spacing^dim, densities relative to that at rest, G_ij = V grad W_ij and G_i = sum_j G_ij + the walls' part, a pressure k (p / rho^2)
+accelerates by a_i = -sum_j (k_i + k_j) G_ij - k_i (walls' part), and changes the density at the rate sum_j (u_i - u_j) . G_ij + u_i . (walls' part),
+each the transpose of the other. Two solves a step, both by Jacobi iterations with diagonal 1 / alpha = |G_i|^2 + sum_j |G_ij|^2, relaxed
+by one half, k >= 0:
+
+    no divergence:     dt times the rate of the velocity <= 0,
+    constant density:  rho + dt times the rate of the velocity <= 1.
+
+An iteration is two sweeps over the pairs, whose gradients are stored: they, not distances, are what it reads. Pressures start from those of the step
+before. A solve ends when its mean error over all particles is below ``density_error`` (``divergence_error``), after at least ``LEAST``
+iterations and at most ``iterations``; one that did not end so is counted, and its frame is repeated with half the step.
+"""
+
+from sim.taichi_runtime import ti
+
+#: Iterations of a solve at least.
+LEAST = 2
+#: Relaxation of a Jacobi iteration (Bender & Koschier 2017, section 3.3).
+RELAXATION = 0.5
+#: Particles with fewer neighbours than this are not held free of divergence: spray would stick together (as in SPlisHSPlasH).
+FEW = {2: 7, 3: 20}
+
+
+@ti.data_oriented
+class DFSPH:
+    """Fields of the pressures; ``base`` has particles, pairs and walls (``sim.sph.solver._Kernels``)."""
+
+    def __init__(self, base, capacity: int, pairs: int):
+        self.base, self.dim, self.structure = base, base.dim, base.structure
+        self.gradient = ti.Vector.field(4, ti.f32, pairs)  # G_ij of the pairs within reach, packed; lane 3: V W
+        self.near = ti.field(ti.i32, pairs)
+        self.begin = ti.field(ti.i32, capacity + 1)
+        self.sums = ti.Vector.field(4, ti.f32, capacity)  # sum_j G_ij; lane 3: sum_j |G_ij|^2, then alpha
+        self.wall = ti.Vector.field(4, ti.f32, capacity)  # the walls' part of G_i; lane 3: density
+        self.push = ti.Vector.field(4, ti.f32, capacity)  # a_i; lane 3: rate of the density
+        self.source = ti.field(ti.f32, capacity)
+        self.members = ti.field(ti.i32, capacity)
+        self.pressure = ti.Vector.field(2, ti.f32, capacity)  # k dt^2 of the two solves: divergence, density
+        self.state = [self.pressure]
+
+    @ti.func
+    def gather(self, n):
+        """Gradients of the pairs within reach, densities, alpha."""
+        base = self.base
+        V, K = base.number[base.VOLUME], base.number[base.KERNEL]
+        for i in range(n):
+            self.sums[i] = ti.Vector.zero(ti.f32, 4)
+            gradient = base.walls(base.x[i])
+            gradient[3] += V * K
+            self.wall[i] = gradient
+            self.members[i] = 0
+        m = 0
+        for i in range(n):
+            self.begin[i] = m
+            xi = base.x[i]
+            S, rho = ti.Vector.zero(ti.f32, 4), 0.0
+            first = m
+            for k in range(base.neighbours.first[i], base.neighbours.first[i + 1]):
+                j = base.neighbours.other[k]
+                r = base.neighbours.apart(xi - base.x[j])
+                r[3] = 0.0
+                q2 = r.norm_sqr()
+                q = ti.sqrt(ti.min(q2, 1.0))
+                t = 1.0 - q
+                t3 = t * t * t
+                G = (-20.0 * K * V * t3) * r
+                w = V * K * t3 * t * (1.0 + 4.0 * q)
+                s = G.norm_sqr()
+                self.near[m] = j
+                H = G
+                H[3] = w
+                self.gradient[m] = H
+                G[3] = s
+                S += G
+                rho += w
+                back = -G
+                back[3] = s
+                self.sums[j] += back
+                self.wall[j][3] += w
+                inside = ti.cast(q2 < 1.0, ti.i32)
+                self.members[j] += inside
+                m += inside
+            self.sums[i] += S
+            self.wall[i][3] += rho
+            self.members[i] += m - first
+        self.begin[n] = m
+        for i in range(n):
+            G = self.sums[i] + self.wall[i]
+            norm = G[0] * G[0] + G[1] * G[1] + G[2] * G[2] + self.sums[i][3]
+            self.sums[i][3] = 1.0 / ti.max(norm, 1e-6)
+
+    @ti.func
+    def rate(self, n, field: ti.template()):
+        """push[3]: rate of the density by a velocity or acceleration ``field``."""
+        for i in range(n):
+            u, g = field[i], self.wall[i]
+            self.push[i][3] = u[0] * g[0] + u[1] * g[1] + u[2] * g[2]
+        for i in range(n):
+            ui, total = field[i], 0.0
+            for m in range(self.begin[i], self.begin[i + 1]):
+                j = self.near[m]
+                p = (ui - field[j]) * self.gradient[m]
+                d = p[0] + p[1] + p[2]
+                total += d
+                self.push[j][3] += d
+            self.push[i][3] += total
+
+    @ti.func
+    def accelerate(self, n, which):
+        """push[:3]: accelerations by the pressures."""
+        for i in range(n):
+            self.push[i] = -self.pressure[i][which] * self.wall[i]
+        for i in range(n):
+            ki, total = self.pressure[i][which], ti.Vector.zero(ti.f32, 4)
+            for m in range(self.begin[i], self.begin[i + 1]):
+                j = self.near[m]
+                f = (ki + self.pressure[j][which]) * self.gradient[m]
+                total += f
+                self.push[j] += f
+            self.push[i] -= total
+
+    @ti.func
+    def solve(self, n, which, dt, tolerance, most):
+        """One of the two solves (0: divergence, 1: density); changes the velocities. Returns iterations and mean error (relative density).
+
+        ``which`` is data, so that the code is there once. Pressures are times dt^2 throughout, accelerations too.
+        """
+        base = self.base
+        self.rate(n, base.v)
+        for i in range(n):
+            # Density after the step, above rest.
+            s = dt * self.push[i][3]
+            if which == 1:
+                s += self.wall[i][3] - 1.0
+            elif self.members[i] < ti.static(FEW[self.dim]):
+                s = -1.0
+            self.source[i] = s
+            self.pressure[i][which] = ti.select(s > 0.0, base.number[base.WARM] * self.pressure[i][which], 0.0)
+        iterations, error = 0, 1e30
+        while iterations < most and (iterations < LEAST or error > tolerance):
+            self.accelerate(n, which)
+            self.rate(n, self.push)
+            error = 0.0
+            for i in range(n):
+                left = self.source[i] + self.push[i][3]
+                self.pressure[i][which] = ti.max(self.pressure[i][which] + RELAXATION * left * self.sums[i][3], 0.0)
+                error += ti.max(left, 0.0)
+            error /= ti.cast(n, ti.f32)
+            iterations += 1
+        self.accelerate(n, which)
+        for i in range(n):
+            for d in ti.static(range(self.dim)):
+                base.v[i][d] += self.push[i][d] / dt
+        return iterations, error
+
+    @ti.func
+    def limit(self, n, g):
+        """Largest step: a share of a spacing by the speed that gravity leaves, and by gravity alone; and the largest speed."""
+        base = self.base
+        fast = 0.0
+        for i in range(n):
+            u = base.v[i]
+            u[3] = 0.0
+            fast = ti.max(fast, u.norm_sqr())
+        fast = ti.sqrt(fast)
+        way = base.number[base.CFL] * base.number[base.SPACING]
+        pull = g.norm()
+        # fast dt + pull dt^2 = way.
+        return 2.0 * way / ti.max(fast + ti.sqrt(fast * fast + 4.0 * pull * way), 1e-12), fast
+
+    @ti.func
+    def step(self, n, dt, g, fast, report: ti.template()):
+        base = self.base
+        base.list_pairs(n, report)
+        self.gather(n)
+        for which in range(2):
+            if which == 1:
+                for i in range(n):
+                    base.v[i] += dt * g
+            tolerance = ti.select(which == 1, base.number[base.DENSITY_ERROR], base.number[base.DIVERGENCE_ERROR])
+            iterations, error = self.solve(n, which, dt, tolerance, ti.cast(base.number[base.ITERATIONS], ti.i32))
+            report[base.SOLVED + which] += ti.cast(iterations, ti.f64)
+            report[base.ERROR + which] = ti.max(report[base.ERROR + which], ti.cast(error, ti.f64))
+            report[base.UNSOLVED] += ti.cast(not error <= tolerance, ti.f64)
+        for i in range(n):
+            base.x[i] += dt * base.v[i]
+            base.enclose(i)

@@ -1,0 +1,437 @@
+"""Smoothed particle hydrodynamics in 2D and 3D: what WCSPH and DFSPH share, under the ``Simulator`` contract.
+
+Lengths are in support radii of the kernel, densities relative to that at rest, time in seconds. All vectors have four lanes whatever the
+dimension, as in ``sim.mpm.solver``: uniform lanes are what the compiler turns into vector instructions, and 2D and 3D share their code.
+
+Decision: one kernel a frame, on one thread, with the adaptive steps inside. Particles interact with walls through integrals of the kernel over
+half-spaces (``sim.sph.kernel``), so there are no boundary particles to search.
+"""
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+from sim.errors import InputError
+from sim.mpm.decomposition import finite
+from sim.scene import Incompressible, Scene
+from sim.simulator import Kind, SimulationError, Start
+from sim.sph.dfsph import DFSPH
+from sim.sph.kernel import ENTRIES, SHARE, SLOPE, constant, lattice_scale, wall_table
+from sim.sph.neighbours import FEWEST, SKIN, Neighbours
+from sim.sph.wcsph import WCSPH
+from sim.taichi_runtime import compiling, start_taichi, ti
+
+#: Halvings of the planned step before a trajectory is given up.
+MAX_HALVINGS = 6
+#: Steps of a frame at most, as a multiple of those planned at its start: speeds that run away shorten steps for ever.
+MOST_STEPS = 64
+#: Distance from a wall, in support radii, at which particles are stopped.
+HAIR = 1e-4
+#: Room in the list of pairs, as a multiple of those of a lattice at rest.
+ROOM = 2.5
+
+
+@dataclass(frozen=True)
+class Structure:
+    """What is compiled in."""
+
+    dim: int
+    method: str
+    periodic: tuple[bool, ...]
+    no_slip: bool
+    shifting: bool
+    shaken: bool
+
+
+def _capacity(particles: int) -> int:
+    """Particles that fields are made for: few different numbers, for each compiles anew."""
+    step = 1 << max(int(particles).bit_length() - 3, 6)
+    return -(-particles // step) * step
+
+
+@ti.data_oriented
+class _Kernels:
+    """Fields and compiled code for one ``Structure``."""
+
+    #: Places in ``number``.
+    (COUNT, VOLUME, KERNEL, SPACING, CFL, SOUND, GAMMA, VISCOSITY, ALPHA, DELTA, DENSITY_ERROR, DIVERGENCE_ERROR, ITERATIONS, WARM,
+     NUMBERS) = range(15)
+    #: Places in a frame's report; gravity and the frame's length are read from it.
+    STEPS, STEP, SPEED, SOLVED, ERROR, UNSOLVED, KINETIC, POTENTIAL, ELASTIC, DENSEST, BROKEN, FULL, LISTED, GRAVITY, SPAN, CAP, REPORT = (
+        0, 1, 2, 3, 5, 7, 8, 9, 10, 11, 12, 13, 14, 15, 18, 19, 20)
+
+    def __init__(self, structure: Structure, capacity: int, cells: int, pairs: int):
+        self.structure, self.capacity, self.dim, self.periodic = structure, capacity, structure.dim, structure.periodic
+        self.number = ti.field(ti.f32, self.NUMBERS)
+        self.x, self.v = (ti.Vector.field(4, ti.f32, capacity) for _ in range(2))
+        self.id = ti.field(ti.i32, capacity)
+        self.extent = ti.Vector.field(4, ti.f32, 2)
+        self.table = ti.Vector.field(6, ti.f32, ENTRIES + 2)
+        self.faces = 2 * self.dim
+        self.slide = ti.Vector.field(4, ti.f32, self.faces)
+        self.neighbours = Neighbours(self.dim, capacity, cells, pairs, self.periodic)
+        self.scheme = (DFSPH if structure.method == "dfsph" else WCSPH)(self, capacity, pairs)
+        self.state = [self.x, self.v, *self.scheme.state]
+        self.moved, self.saved = ([ti.Vector.field(field.n, ti.f32, capacity) for field in self.state] for _ in range(2))
+        self.moved_id, self.saved_id = (ti.field(ti.i32, capacity) for _ in range(2))
+
+    # -- walls
+    @ti.func
+    def look(self, s):
+        """``wall_table`` at a distance s <= 1."""
+        u = ti.max(s, 0.0) * float(ENTRIES)
+        k = ti.cast(u, ti.i32)
+        f = u - ti.cast(k, ti.f32)
+        return (1.0 - f) * self.table[k] + f * self.table[k + 1]
+
+    @ti.func
+    def face(self, x, f: ti.template()):
+        """Distance to a wall and the normal away from it; 2 for one that is not there."""
+        s, n = 2.0, ti.Vector.zero(ti.f32, 4)
+        if ti.static(not self.periodic[f // 2]):
+            if ti.static(f % 2 == 0):
+                s, n[f // 2] = x[f // 2] - self.extent[0][f // 2], 1.0
+            else:
+                s, n[f // 2] = self.extent[1][f // 2] - x[f // 2], -1.0
+        return s, n
+
+    @ti.func
+    def walls(self, x):
+        """Gradient of the share of the kernel that lies in walls, and (lane 3) the share.
+
+        What is fluid of the kernel is taken as the product of what each wall leaves: exact for one wall, and smooth in corners.
+        """
+        fluid, gradient = 1.0, ti.Vector.zero(ti.f32, 4)
+        for f in ti.static(range(self.faces)):
+            s, n = self.face(x, f)
+            if s < 1.0:
+                T = self.look(s)
+                gradient = (1.0 - T[SHARE]) * gradient + (fluid * T[SLOPE]) * n
+                fluid *= 1.0 - T[SHARE]
+        gradient[3] = 1.0 - fluid
+        return gradient
+
+    @ti.func
+    def enclose(self, i):
+        """Keep a particle inside the walls, or bring it back through a periodic face."""
+        x = self.x[i]
+        for d in ti.static(range(self.dim)):
+            if ti.static(self.periodic[d]):
+                x[d] -= self.neighbours.length[None][d] * ti.floor(x[d] / self.neighbours.length[None][d])
+            else:
+                inside = ti.min(ti.max(x[d], self.extent[0][d] + HAIR), self.extent[1][d] - HAIR)
+                if inside != x[d]:
+                    self.v[i][d] = 0.0
+                if finite(x[d]):
+                    x[d] = inside
+        self.x[i] = x
+
+    # -- pairs
+    @ti.func
+    def list_pairs(self, n, report: ti.template()):
+        if self.neighbours.stale(self.x, n):
+            self.neighbours.sort(self.x, n)
+            for i in range(n):
+                k = self.neighbours.to[i]
+                for f in ti.static(range(len(self.state))):
+                    self.moved[f][k] = self.state[f][i]
+                self.moved_id[k] = self.id[i]
+            for i in range(n):
+                for f in ti.static(range(len(self.state))):
+                    self.state[f][i] = self.moved[f][i]
+                self.id[i] = self.moved_id[i]
+            self.neighbours.pair(self.x, n)
+            report[self.LISTED] += 1.0
+
+    # -- kernels
+    @ti.kernel
+    def frame(self, keep: ti.i32, steps: ti.i32, position: ti.types.ndarray(ti.f32, 2), report: ti.types.ndarray(ti.f64, 1)):
+        """One frame of at most so many steps; ``keep`` saves the state first."""
+        ti.loop_config(serialize=True)
+        for _ in range(1):
+            n = ti.cast(self.number[self.COUNT], ti.i32)
+            for i in range(keep * n):
+                for f in ti.static(range(len(self.state))):
+                    self.saved[f][i] = self.state[f][i]
+                self.saved_id[i] = self.id[i]
+            g = ti.Vector.zero(ti.f32, 4)
+            for d in ti.static(range(self.dim)):
+                g[d] = ti.cast(report[self.GRAVITY + d], ti.f32)
+            span, cap = ti.cast(report[self.SPAN], ti.f32), ti.cast(report[self.CAP], ti.f32)
+            left, taken = span, 0
+            while left > 1e-6 * span and taken < steps and self.neighbours.count[None] < self.neighbours.other.shape[0]:
+                limit, fast = self.scheme.limit(n, g)
+                dt = ti.min(limit, cap)
+                # Steps divide what is left of the frame.
+                dt = left / ti.max(ti.ceil(left / dt - 1e-4), 1.0)
+                self.scheme.step(n, dt, g, fast, report)
+                left -= dt
+                taken += 1
+                report[self.STEP] = ti.min(report[self.STEP], ti.cast(dt, ti.f64))
+                report[self.SPEED] = ti.max(report[self.SPEED], ti.cast(fast, ti.f64))
+            report[self.STEPS] = ti.cast(taken, ti.f64)
+            report[self.BROKEN] += ti.cast(left > 1e-6 * span, ti.f64)
+            report[self.FULL] = ti.cast(self.neighbours.count[None] >= self.neighbours.other.shape[0], ti.f64)
+            self.sum_up(n, position, report)
+
+    @ti.func
+    def sum_up(self, n, position: ti.template(), report: ti.template()):
+        """Positions [support radii] in the order of the scene; energies per mass of a particle."""
+        kinetic, height, fast, dense, broken = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64), 0.0, 0.0, 0
+        for i in range(n):
+            x, u = self.x[i], self.v[i]
+            place = 0.0
+            for d in ti.static(range(self.dim)):
+                position[self.id[i], d] = x[d]
+                place -= ti.cast(report[self.GRAVITY + d], ti.f32) * x[d]
+            speed2 = u[0] * u[0] + u[1] * u[1] + u[2] * u[2]
+            kinetic += ti.cast(0.5 * speed2, ti.f64)
+            height += ti.cast(place, ti.f64)
+            fast = ti.max(fast, speed2)
+            rho = u[3]
+            if ti.static(self.structure.method == "dfsph"):
+                rho = self.scheme.wall[i][3]
+            dense = ti.max(dense, rho)
+            broken += ti.cast(not finite(x[0] + x[1] + x[2] + speed2 + rho), ti.i32)
+        report[self.KINETIC], report[self.POTENTIAL], report[self.DENSEST] = kinetic, height, ti.cast(dense, ti.f64)
+        report[self.SPEED] = ti.max(report[self.SPEED], ti.cast(ti.sqrt(fast), ti.f64))
+        report[self.BROKEN] += ti.cast(broken, ti.f64)
+
+    @ti.kernel
+    def load(self, data: ti.types.ndarray(ti.f32, 2), numbers: ti.types.ndarray(ti.f32, 2), table: ti.types.ndarray(ti.f32, 2)):
+        """Positions and velocities [n, 2 dim]; numbers [4 + faces, 15]: ``number``; extent (lower, upper); cells and 1 / their widths; slides."""
+        ti.loop_config(serialize=True)
+        for _ in range(1):
+            for k in range(self.NUMBERS):
+                self.number[k] = numbers[0, k]
+            for d in ti.static(range(self.dim)):
+                self.extent[0][d], self.extent[1][d] = numbers[1, d], numbers[2, d]
+                self.neighbours.size[None][d], self.neighbours.edge[None][d] = ti.cast(numbers[3, d], ti.i32), numbers[3, 4 + d]
+                self.neighbours.length[None][d] = numbers[2, d] - numbers[1, d]
+                for f in range(self.faces):
+                    self.slide[f][d] = numbers[4 + f, d]
+            for k in range(ENTRIES + 2):
+                for c in ti.static(range(6)):
+                    self.table[k][c] = table[ti.min(k, ENTRIES), c]
+            n = data.shape[0]
+            for i in range(n):
+                self.id[i] = i
+                for f in ti.static(range(len(self.state))):
+                    self.state[f][i] *= 0.0
+                for d in ti.static(range(self.dim)):
+                    self.x[i][d], self.v[i][d] = data[i, d], data[i, self.dim + d]
+                # Far from anywhere: the list of pairs is stale.
+                self.neighbours.listed_at[i] = ti.Vector([-10.0, 0.0, 0.0, 0.0])
+                if ti.static(self.structure.method == "wcsph"):
+                    self.v[i][3] = numbers[1, 4]
+            self.neighbours.count[None] = 0
+
+    @ti.kernel
+    def restore(self, n: ti.i32):
+        ti.loop_config(serialize=True)
+        for _ in range(1):
+            for i in range(n):
+                for f in ti.static(range(len(self.state))):
+                    self.state[f][i] = self.saved[f][i]
+                self.id[i] = self.saved_id[i]
+                self.neighbours.listed_at[i] = ti.Vector([-10.0, 0.0, 0.0, 0.0])
+            self.neighbours.count[None] = 0
+
+
+class SPHSimulator:
+    """The solver under the ``Simulator`` contract; also driven directly by ``load`` and ``frame``.
+
+    Overrides make the rungs of a solver ladder: ``cfl`` (Courant number; default the scene's), ``particles`` ("teacher": refined as the scene
+    says; "recorded": the tracked set alone), ``tolerance`` (factor on the errors at which DFSPH's solves end), ``stiffness`` (factor on the
+    square of WCSPH's speed of sound), ``perturbation`` (length: random displacement of the start, for the chaos floor).
+    """
+
+    def __init__(self, *, name: str = "sph", kind: Kind = "reference", cfl: float | None = None, particles: str = "teacher", tolerance: float = 1.0,
+                 stiffness: float = 1.0, perturbation: float = 0.0):
+        if particles not in ("teacher", "recorded"):
+            raise InputError(name, "particles", particles, "must be teacher or recorded")
+        self.name, self.kind = name, kind
+        self.settings = {"cfl": cfl, "particles": particles, "tolerance": tolerance, "stiffness": stiffness, "perturbation": perturbation}
+        self.compile_seconds = 0.0
+        self._built: tuple | None = None
+
+    # -- what a scene needs
+    def _structure(self, scene: Scene) -> Structure:
+        periodic = tuple(axis in scene.periodic for axis in "xyz"[: scene.dim])
+        shifting = scene.solver.method == "wcsph" and scene.solver.shifting
+        return Structure(scene.dim, scene.solver.method, periodic, scene.walls.friction == "sticky", shifting, scene.container is not None)
+
+    def _refine(self, scene: Scene) -> int:
+        return scene.refine if self.settings["particles"] == "teacher" else 1
+
+    def _layout(self, scene: Scene) -> tuple[float, float, np.ndarray]:
+        """Spacing and support radius [length], cells along each axis."""
+        spacing = scene.spacing / self._refine(scene)
+        support = spacing * scene.solver.support
+        lower, upper = np.array(scene.bounds).T
+        cells = np.maximum(np.floor((upper - lower) / support / (1 + SKIN)).astype(int), 1)
+        for axis, count in zip("xyz", cells, strict=False):
+            if axis in scene.periodic and count < FEWEST:
+                remedy = f"the box is too narrow there for its particles: {FEWEST} kernels must fit; use more cells"
+                raise InputError(scene.name, "periodic", axis, remedy)
+        return spacing, support, cells
+
+    def _numbers(self, scene: Scene) -> np.ndarray:
+        """As ``_Kernels.load`` takes them."""
+        spacing, support, cells = self._layout(scene)
+        lower, upper = np.array(scene.bounds).T
+        dim, water, solver, k = scene.dim, self._water(scene), scene.solver, _Kernels
+        numbers = np.zeros((4 + 2 * dim, max(k.NUMBERS, 8)))
+        row = numbers[0]
+        d = spacing / support
+        row[k.VOLUME], row[k.KERNEL], row[k.SPACING] = d**dim, constant(dim) * lattice_scale(dim, d), d
+        row[k.CFL] = self.settings["cfl"] or scene.cfl
+        row[k.VISCOSITY] = water.viscosity / water.density / support**2
+        if isinstance(solver, Incompressible):
+            row[k.DENSITY_ERROR], row[k.DIVERGENCE_ERROR] = (self.settings["tolerance"] * e for e in (solver.density_error, solver.divergence_error))
+            row[k.ITERATIONS], row[k.WARM] = solver.iterations, 1.0
+        else:
+            row[k.SOUND] = water.sound_speed * np.sqrt(self.settings["stiffness"]) / support
+            row[k.GAMMA], row[k.ALPHA], row[k.DELTA] = water.gamma, solver.artificial_viscosity, solver.density_diffusion
+        numbers[2, :dim], numbers[1, 4] = (upper - lower) / support, 1.0
+        numbers[3, :dim], numbers[3, 4 : 4 + dim] = cells + 2, cells / ((upper - lower) / support)
+        for face, velocity in scene.walls.velocity.items():
+            numbers[4 + 2 * "xyz".index(face[0]) + "-+".index(face[1]), :dim] = np.array(velocity) / support
+        return numbers
+
+    def _water(self, scene: Scene):
+        return next(material for material in scene.materials.values() if material.model == "water")
+
+    # -- state
+    def load(self, scene: Scene) -> None:
+        """Set the state of frame 0, compiling on first use. Raises ``InputError``."""
+        begun = time.perf_counter()
+        start_taichi()
+        structure, (spacing, support, cells) = self._structure(scene), self._layout(scene)
+        particles = scene.particles(self._refine(scene))
+        n, dim = particles.position.shape
+        capacity, boxes = _capacity(n), int(np.prod(cells + 2))
+        neighbours = {2: np.pi, 3: 4 * np.pi / 3}[dim] * (scene.solver.support * (1 + SKIN)) ** dim / 2
+        pairs = int(ROOM * neighbours * capacity) + 4096
+        built = self._built
+        if built is None or built[0] != structure or built[1] < n or built[2] < boxes or built[3] < pairs:
+            self._kernels = _Kernels(structure, capacity, boxes, pairs)
+            self._built = (structure, capacity, boxes, pairs)
+            fresh = True
+        else:
+            fresh = False
+        self._scene, self._support, self._tracked = scene, support, particles.tracked
+        self._boundary = scene.boundary.astype(np.float32)
+        self._acceleration, self._frame = scene.acceleration(), 0
+        self._mass = self._water(scene).density * spacing**dim
+        self._position = np.zeros((n, dim), np.float32)
+        position = particles.position
+        if self.settings["perturbation"]:
+            rng = np.random.default_rng(np.random.SeedSequence([scene.seed, 2]))
+            position = position + rng.uniform(-1, 1, position.shape) * self.settings["perturbation"]
+        lower, upper = np.array(scene.bounds).T
+        self._lower = lower
+        inside = np.clip((position - lower) / support, HAIR, (upper - lower) / support - HAIR)
+        data = np.concatenate([inside, particles.velocity / support], 1).astype(np.float32)
+        numbers = self._numbers(scene)
+        numbers[0, _Kernels.COUNT] = n
+        table = wall_table(dim, spacing / support).astype(np.float32)
+        with compiling(dim):
+            self._kernels.load(data, numbers.astype(np.float32), table)
+            self._run(0.0, np.inf, 0, keep=True)
+            if fresh:
+                self._kernels.restore(n)
+        if fresh:
+            self.compile_seconds += time.perf_counter() - begun
+
+    def _run(self, span: float, cap: float, steps: int, keep: bool) -> np.ndarray:
+        k, scene = _Kernels, self._scene
+        report = np.zeros(k.REPORT)
+        report[k.STEP] = span
+        felt = np.array(scene.gravity) - self._acceleration[min(self._frame, len(self._acceleration) - 1)]
+        report[k.GRAVITY : k.GRAVITY + scene.dim] = felt / self._support
+        report[k.SPAN], report[k.CAP] = span, min(cap, 1e30)
+        self._kernels.frame(int(keep), steps, self._position, report)
+        joule = self._mass * self._support**2
+        self._diagnostics = {
+            "kinetic_energy": report[k.KINETIC] * joule, "potential_energy": report[k.POTENTIAL] * joule,
+            "max_speed": report[k.SPEED] * self._support, "substeps": report[k.STEPS], "dt": report[k.STEP], "density": report[k.DENSEST],
+        }
+        if scene.solver.method == "dfsph":
+            self._diagnostics |= {
+                "iterations_divergence": report[k.SOLVED], "iterations_density": report[k.SOLVED + 1], "divergence_error": report[k.ERROR],
+                "density_error": report[k.ERROR + 1], "unsolved": report[k.UNSOLVED],
+            }
+        return report
+
+    def frame(self) -> np.ndarray:
+        """Advance one frame; positions of the recorded particles, kinematic ones last, [n, dim] float32. Raises ``SimulationError``."""
+        k, scene = _Kernels, self._scene
+        fixed = None if self.settings["cfl"] else scene.time_step
+        cap = fixed or np.inf
+        for attempt in range(1 if fixed else MAX_HALVINGS + 1):
+            report = self._run(scene.frame_step, cap, self._most(), keep=attempt == 0)
+            if np.isfinite(report).all() and not report[k.BROKEN] and not report[k.UNSOLVED] and not report[k.FULL]:
+                self._frame += 1
+                return self._recorded()
+            self._kernels.restore(len(self._position))
+            cap = report[k.STEP] / 2 if report[k.STEP] > 0 else scene.frame_step / 2 ** (attempt + 1)
+        raise SimulationError(self._why(report))
+
+    def _most(self) -> int:
+        return 100_000
+
+    def _why(self, report: np.ndarray) -> str:
+        k = _Kernels
+        if report[k.FULL]:
+            return "particles have gathered beyond the room for pairs"
+        if report[k.UNSOLVED]:
+            errors = ", ".join(f"{what} {report[k.ERROR + which]:.2g}" for which, what in enumerate(("divergence", "density")))
+            return f"pressures did not converge in {self._scene.solver.iterations} iterations ({errors}), at a step of {report[k.STEP]:.3g} s"
+        return f"time step fell below {report[k.STEP]:.3g} s without a finite, stable frame"
+
+    def _recorded(self) -> np.ndarray:
+        moving = (self._lower + self._position[self._tracked].astype(float) * self._support).astype(np.float32)
+        return np.concatenate([moving, self._boundary])
+
+    def diagnostics(self) -> dict[str, float]:
+        """Of the current frame: energies [J, per unit depth in 2D], max speed [m/s], substeps, shortest step dt [s], largest density over that at
+        rest; DFSPH: iterations of both solves, their largest mean errors, how many solves did not converge."""
+        return dict(self._diagnostics)
+
+    def state(self) -> dict[str, np.ndarray]:
+        """All simulated particles in the order of the scene, float64: ``position`` [length], ``velocity`` [length / s], [n, dim] each, ``density``
+        over that at rest, ``pressure`` [Pa], [n] each."""
+        kernels, n, dim, h = self._kernels, *self._position.shape, self._support
+        order = np.argsort(kernels.id.to_numpy()[:n])
+        x, v = kernels.x.to_numpy()[:n][order].astype(float), kernels.v.to_numpy()[:n][order].astype(float)
+        found = {"position": self._lower + x[:, :dim] * h, "velocity": v[:, :dim] * h}
+        water = self._water(self._scene)
+        if self._scene.solver.method == "wcsph":
+            rho = v[:, 3]
+            found["density"] = rho
+            found["pressure"] = water.density * x[:, 3] * rho**2 * h**2
+        else:
+            found["density"] = kernels.scheme.wall.to_numpy()[:n, 3][order].astype(float)
+            k = kernels.scheme.pressure.to_numpy()[:n][order].astype(float)
+            found["pressure"] = k.sum(1) / self._diagnostics["dt"] ** 2 * water.density * h**2
+        return found
+
+    def set_velocity(self, velocity: np.ndarray) -> None:
+        """Replace the velocities [n, dim] of all particles. For starts that no scene describes."""
+        kernels, (n, dim) = self._kernels, velocity.shape
+        values = kernels.v.to_numpy()
+        values[:n, :dim] = (velocity / self._support)[kernels.id.to_numpy()[:n]]
+        kernels.v.from_numpy(values)
+
+    # -- the Simulator contract
+    def begin(self, start: Start) -> None:
+        """Run the known frames from the scene's own start, so that the solver stands where the history ends."""
+        self.load(Scene.from_dict(start.scene))
+        for _ in range(start.present):
+            self.frame()
+
+    def advance(self) -> np.ndarray:
+        """The next frame, [1, particles, dim]."""
+        return self.frame()[None]

@@ -1,0 +1,176 @@
+"""Weakly compressible SPH (Monaghan 1994) with density diffusion (Fourtakas et al. 2019) and particle shifting (Lind et al. 2012; Sun et al. 2017).
+
+    d rho_i / dt = sum_j V (u_i - u_j) . grad W_ij + 2 delta h c sum_j V (rho_j - rho_i - rho_H) |W'| / r
+    d u_i / dt   = -sum_j V (P_i + P_j) grad W_ij + g - sum_j V (2 (dim + 2) nu + alpha h c) (u_ij . r_ij) r_ij |W'| / r^3
+    P = p / rho^2,  p = (c^2 / gamma) (rho^gamma - 1),  rho_H = g . (x_j - x_i) / c^2,  h = 1/2
+
+with densities over that at rest. The artificial viscosity alpha acts on what approaches. Walls (``sim.sph.kernel``) continue the fluid:
+the pressure across them by P_i + g . (x' - x_i) (Adami et al. 2012), no suction, and along them by the fluid's own gradient, which the particle's
+neighbours show on its own side only (TANGENT). Left out, water at a vertical wall hangs on less than its pressure and sinks.
+
+Shifting moves particles down the gradient of their concentration, by 2 max|u| dt grad C (Sun et al. 2017, eq. 10), where they are inside.
+
+Time: velocity Verlet with predicted velocity and density (Springel 2005, section 4.2), one sweep over the pairs a step.
+"""
+
+from sim.sph.kernel import DRAG, NORMAL, SHARE, SLOPE, SPREAD, TANGENT
+from sim.taichi_runtime import ti
+
+#: Particles count as inside the fluid where sum_j V r . grad W exceeds this share of the dimension (Lee et al. 2008: 1.5 of 2).
+INSIDE = 0.75
+#: Distance to a wall in support radii from which on its drag grows no more.
+CLOSEST = 0.1
+
+
+@ti.data_oriented
+class WCSPH:
+    """``base``: particles, pairs and walls (``sim.sph.solver._Kernels``). v[3] is the density over that at rest, x[3] is P."""
+
+    def __init__(self, base, capacity: int, pairs: int):
+        self.base, self.dim, self.structure = base, base.dim, base.structure
+        self.rate = ti.Vector.field(4, ti.f32, capacity)  # acceleration; lane 3: rate of the density
+        self.before = ti.Vector.field(4, ti.f32, capacity)
+        self.state = [self.rate, self.before]
+        if self.structure.shifting:
+            self.crowd = ti.Vector.field(4, ti.f32, capacity)  # gradient of the concentration; lane 3: minus the divergence of position
+            self.state.append(self.crowd)
+        if self.structure.no_slip:
+            self.rub = ti.Vector.field(4, ti.f32, capacity)  # viscous acceleration, apart from that by pressures
+
+    @ti.func
+    def sweep(self, n, g):
+        """``rate`` and ``crowd`` of the current positions, velocities and densities."""
+        base = self.base
+        V, K, c = base.number[base.VOLUME], base.number[base.KERNEL], base.number[base.SOUND]
+        gamma, delta = base.number[base.GAMMA], 2.0 * base.number[base.DELTA] * 0.5 * c
+        alpha, nu = 0.5 * base.number[base.ALPHA] * c, 2.0 * (self.dim + 2) * base.number[base.VISCOSITY]
+        for i in range(n):
+            rho = base.v[i][3]
+            base.x[i][3] = c * c / gamma * (ti.pow(rho, gamma) - 1.0) / (rho * rho)
+            self.rate[i] = ti.Vector.zero(ti.f32, 4)
+            if ti.static(self.structure.shifting):
+                self.crowd[i] = ti.Vector.zero(ti.f32, 4)
+            if ti.static(self.structure.no_slip):
+                self.rub[i] = ti.Vector.zero(ti.f32, 4)
+        scale = 20.0 * K * V
+        slant = g / (c * c)
+        for i in range(n):
+            xi, vi = base.x[i], base.v[i]
+            A, B, R = ti.Vector.zero(ti.f32, 4), ti.Vector.zero(ti.f32, 4), ti.Vector.zero(ti.f32, 4)
+            for k in range(base.neighbours.first[i], base.neighbours.first[i + 1]):
+                j = base.neighbours.other[k]
+                xj = base.x[j]
+                r, u = xi - xj, vi - base.v[j]
+                P, jump = xi[3] + xj[3], u[3]
+                r = base.neighbours.apart(r)
+                r[3] = 0.0
+                q2 = r.norm_sqr()
+                t = 1.0 - ti.sqrt(ti.min(q2, 1.0))
+                q = scale * t * t * t  # V |W'| / r
+                ur = u * r
+                closing = ur[0] + ur[1] + ur[2]
+                fall = slant * r
+                D = q * delta * (fall[0] + fall[1] + fall[2] - jump)
+                S = (nu * closing + alpha * ti.min(closing, 0.0)) / (q2 + 1e-4)
+                F = (q * P) * r
+                if ti.static(self.structure.no_slip):
+                    f = (q * S) * r
+                    R += f
+                    self.rub[j] -= f
+                else:
+                    F -= (q * S) * r
+                # The continuity equation's part is the same for both, the diffusion's the opposite.
+                F[3] = D - q * closing
+                A += F
+                F[3] = D + q * closing
+                self.rate[j] -= F
+                if ti.static(self.structure.shifting):
+                    C = -q * r
+                    C[3] = q * q2
+                    B += C
+                    C = -C
+                    C[3] = q * q2
+                    self.crowd[j] += C
+            self.rate[i] += A
+            if ti.static(self.structure.shifting):
+                self.crowd[i] += B
+            if ti.static(self.structure.no_slip):
+                self.rub[i] += R
+        for i in range(n):
+            self.by_walls(i, g)
+
+    @ti.func
+    def by_walls(self, i, g):
+        """The walls' part, and gravity's."""
+        base = self.base
+        x, u = base.x[i], base.v[i]
+        P = ti.max(x[3], 0.0)
+        A = self.rate[i]
+        fluid = 1.0
+        for f in ti.static(range(base.faces)):
+            s, n = base.face(x, f)
+            if s < 1.0:
+                fluid *= 1.0 - base.look(s)[SHARE]
+        if fluid < 1.0:
+            for f in ti.static(range(base.faces)):
+                s, n = base.face(x, f)
+                if s < 1.0:
+                    T = base.look(s)
+                    across = A[0] * n[0] + A[1] * n[1] + A[2] * n[2]
+                    along = A - across * n
+                    along[3] = 0.0
+                    A += (T[TANGENT] / (1.0 - T[TANGENT])) * along
+            for f in ti.static(range(base.faces)):
+                s, n = base.face(x, f)
+                if s < 1.0:
+                    T = base.look(s)
+                    weight = fluid / (1.0 - T[SHARE])
+                    un, gn = u[0] * n[0] + u[1] * n[1] + u[2] * n[2], g[0] * n[0] + g[1] * n[1] + g[2] * n[2]
+                    A -= (weight * (2.0 * P * T[SLOPE] + gn * T[NORMAL])) * n
+                    A[3] += weight * T[SLOPE] * un
+                    if ti.static(self.structure.no_slip):
+                        slip = u - un * n - base.slide[f]
+                        slip[3] = 0.0
+                        A -= (base.number[base.VISCOSITY] * weight * T[DRAG] / ti.max(s, CLOSEST)) * slip
+                    if ti.static(self.structure.shifting):
+                        C = T[SLOPE] * n
+                        C[3] = T[SPREAD]
+                        self.crowd[i] += weight * C
+        if ti.static(self.structure.no_slip):
+            A -= self.rub[i]
+        self.rate[i] = A + g
+
+    @ti.func
+    def limit(self, n, g):
+        """Largest stable step: c of the densest particle, the viscosity, the largest acceleration (Monaghan 1989); and the largest speed."""
+        base = self.base
+        fast, strong, dense = 0.0, 0.0, 1.0
+        for i in range(n):
+            u, a = base.v[i], self.rate[i]
+            dense = ti.max(dense, u[3])
+            u[3], a[3] = 0.0, 0.0
+            fast, strong = ti.max(fast, u.norm_sqr()), ti.max(strong, a.norm_sqr())
+        fast, strong = ti.sqrt(fast), ti.sqrt(strong)
+        c = base.number[base.SOUND] * ti.pow(dense, 0.5 * (base.number[base.GAMMA] - 1.0))
+        dt = base.number[base.CFL] * base.number[base.SPACING] / (c + fast)
+        dt = ti.min(dt, 0.25 * ti.sqrt(0.5 / ti.max(strong, 1e-12)))
+        return ti.min(dt, 0.125 * 0.25 / ti.max(base.number[base.VISCOSITY], 1e-12)), fast
+
+    @ti.func
+    def step(self, n, dt, g, fast, report: ti.template()):
+        """One step; ``rate`` is that of its start."""
+        base = self.base
+        for i in range(n):
+            a = self.rate[i]
+            self.before[i] = a
+            move = dt * base.v[i] + (0.5 * dt * dt) * a
+            if ti.static(self.structure.shifting):
+                move -= ti.select(self.crowd[i][3] > ti.static(INSIDE * self.dim), 2.0 * fast * dt, 0.0) * self.crowd[i]
+            move[3] = 0.0
+            base.x[i] += move
+            base.v[i] += dt * a
+            base.enclose(i)
+        base.list_pairs(n, report)
+        self.sweep(n, g)
+        for i in range(n):
+            base.v[i] += (0.5 * dt) * (self.rate[i] - self.before[i])
