@@ -143,8 +143,8 @@ def generate(
     Finished shards of an earlier run with the same family and seed are checked and kept; a larger count extends a split.
     ``teacher`` (default: the scene's own solver) is called once in each of the ``jobs`` worker processes, so it must be
     importable. Raises ``InputError`` before anything is written (a scene that cannot be sampled, a folder made with other
-    settings, an unwritable folder) and ``RunError`` where the run itself fails (a worker killed, disk full, every trajectory of a split failed); what is
-    finished by then stays, and the same call continues from there.
+    settings, an unwritable folder) and ``RunError`` where the run itself fails (a worker killed, disk full, every trajectory
+    of a split failed); what is finished by then stays, and the same call continues from there.
     """
     out = Path(out)
     teacher = teacher or partial(scene_teacher, family.model.solver.method)

@@ -11,6 +11,12 @@ by one half, k >= 0:
 An iteration is two sweeps over the pairs, whose gradients are stored: they, not distances, are what it reads. Pressures start from those of the step
 before. A solve ends when its mean error over all particles is below ``density_error`` (``divergence_error``), after at least ``LEAST``
 iterations and at most ``iterations``; one that did not end so is counted, and its frame is repeated with half the step.
+
+Without a free surface (``full``: the water fills its box) nothing can expand: densities are then held to their mean, from both sides. That is a linear
+system with a symmetric matrix and takes conjugate gradients: pressures reach across the whole box, and Jacobi's iterations only a particle each.
+
+Viscosity is implicit, whatever its size: conjugate gradients for u + dt nu A sum_j f (u_ij . r_ij) r_ij / r^2 = u* (Weiler et al. 2018; f and A:
+``sim.sph.kernel.viscous_weight``). Each pair's force is along its line, so angular momentum is kept.
 """
 
 from sim.taichi_runtime import ti
@@ -21,6 +27,8 @@ LEAST = 2
 RELAXATION = 0.5
 #: Particles with fewer neighbours than this are not held free of divergence: spray would stick together (as in SPlisHSPlasH).
 FEW = {2: 7, 3: 20}
+#: Residual, relative to the right side, at which the viscous solve ends.
+VISCOUS_ERROR = 1e-5
 
 
 @ti.data_oriented
@@ -39,6 +47,11 @@ class DFSPH:
         self.members = ti.field(ti.i32, capacity)
         self.pressure = ti.Vector.field(2, ti.f32, capacity)  # k dt^2 of the two solves: divergence, density
         self.state = [self.pressure]
+        if self.structure.full:
+            self.krylov = ti.Vector.field(2, ti.f32, capacity)  # direction of the search, residual
+        if self.structure.viscous:
+            self.drag = ti.field(ti.f32, pairs)  # A f / |G|^2
+            self.residual, self.search, self.image = (ti.Vector.field(4, ti.f32, capacity) for _ in range(3))
 
     @ti.func
     def gather(self, n):
@@ -72,6 +85,8 @@ class DFSPH:
                 H = G
                 H[3] = w
                 self.gradient[m] = H
+                if ti.static(self.structure.viscous):
+                    self.drag[m] = base.number[base.THICKNESS] * t * ti.sqrt(t) / (s + 1e-20)
                 G[3] = s
                 S += G
                 rho += w
@@ -108,18 +123,52 @@ class DFSPH:
             self.push[i][3] += total
 
     @ti.func
-    def accelerate(self, n, which):
-        """push[:3]: accelerations by the pressures."""
+    def accelerate(self, n, pressure: ti.template(), which):
+        """push[:3]: accelerations by pressures, a lane of ``pressure``."""
         for i in range(n):
-            self.push[i] = -self.pressure[i][which] * self.wall[i]
+            self.push[i] = -pressure[i][which] * self.wall[i]
         for i in range(n):
-            ki, total = self.pressure[i][which], ti.Vector.zero(ti.f32, 4)
+            ki, total = pressure[i][which], ti.Vector.zero(ti.f32, 4)
             for m in range(self.begin[i], self.begin[i + 1]):
                 j = self.near[m]
-                f = (ki + self.pressure[j][which]) * self.gradient[m]
+                f = (ki + pressure[j][which]) * self.gradient[m]
                 total += f
                 self.push[j] += f
             self.push[i] -= total
+
+    @ti.func
+    def conjugate(self, n, which, tolerance, most):
+        """Conjugate gradients, preconditioned by alpha, for pressures of either sign; iterations and mean absolute error."""
+        self.accelerate(n, self.pressure, which)
+        self.rate(n, self.push)
+        power, error = ti.cast(0.0, ti.f64), 0.0
+        for i in range(n):
+            r = self.source[i] + self.push[i][3]
+            z = r * self.sums[i][3]
+            self.krylov[i] = ti.Vector([z, r])
+            power += ti.cast(r * z, ti.f64)
+            error += ti.abs(r)
+        iterations = 0
+        while iterations < most and (iterations < LEAST or error > tolerance * ti.cast(n, ti.f32)) and power > 0.0:
+            self.accelerate(n, self.krylov, 0)
+            self.rate(n, self.push)
+            work = ti.cast(0.0, ti.f64)
+            for i in range(n):
+                work -= ti.cast(self.krylov[i][0] * self.push[i][3], ti.f64)
+            step, fresh = ti.cast(power / work, ti.f32), ti.cast(0.0, ti.f64)
+            error = 0.0
+            for i in range(n):
+                self.pressure[i][which] += step * self.krylov[i][0]
+                r = self.krylov[i][1] + step * self.push[i][3]
+                self.krylov[i][1] = r
+                fresh += ti.cast(r * r * self.sums[i][3], ti.f64)
+                error += ti.abs(r)
+            turn = ti.cast(fresh / power, ti.f32)
+            for i in range(n):
+                self.krylov[i][0] = self.krylov[i][1] * self.sums[i][3] + turn * self.krylov[i][0]
+            power = fresh
+            iterations += 1
+        return iterations, error / ti.cast(n, ti.f32)
 
     @ti.func
     def solve(self, n, which, dt, tolerance, most):
@@ -129,31 +178,115 @@ class DFSPH:
         """
         base = self.base
         self.rate(n, base.v)
+        mean = 0.0
         for i in range(n):
             # Density after the step, above rest.
             s = dt * self.push[i][3]
             if which == 1:
                 s += self.wall[i][3] - 1.0
-            elif self.members[i] < ti.static(FEW[self.dim]):
+            elif ti.static(not self.structure.full) and self.members[i] < ti.static(FEW[self.dim]):
                 s = -1.0
             self.source[i] = s
-            self.pressure[i][which] = ti.select(s > 0.0, base.number[base.WARM] * self.pressure[i][which], 0.0)
-        iterations, error = 0, 1e30
-        while iterations < most and (iterations < LEAST or error > tolerance):
-            self.accelerate(n, which)
-            self.rate(n, self.push)
-            error = 0.0
+            mean += s
+            if ti.static(not self.structure.full):
+                self.pressure[i][which] = ti.select(s > 0.0, self.pressure[i][which], 0.0)
+        if ti.static(self.structure.full):
             for i in range(n):
-                left = self.source[i] + self.push[i][3]
-                self.pressure[i][which] = ti.max(self.pressure[i][which] + RELAXATION * left * self.sums[i][3], 0.0)
-                error += ti.max(left, 0.0)
-            error /= ti.cast(n, ti.f32)
-            iterations += 1
-        self.accelerate(n, which)
+                self.source[i] -= mean / ti.cast(n, ti.f32)
+        iterations, error = 0, 1e30
+        if ti.static(self.structure.full):
+            iterations, error = self.conjugate(n, which, tolerance, most)
+        else:
+            while iterations < most and (iterations < LEAST or error > tolerance):
+                self.accelerate(n, self.pressure, which)
+                self.rate(n, self.push)
+                error = 0.0
+                for i in range(n):
+                    left = self.source[i] + self.push[i][3]
+                    self.pressure[i][which] = ti.max(self.pressure[i][which] + RELAXATION * left * self.sums[i][3], 0.0)
+                    error += ti.max(left, 0.0)
+                error /= ti.cast(n, ti.f32)
+                iterations += 1
+        self.accelerate(n, self.pressure, which)
         for i in range(n):
             for d in ti.static(range(self.dim)):
                 base.v[i][d] += self.push[i][d] / dt
         return iterations, error
+
+    @ti.func
+    def viscous_image(self, n, dtnu, u: ti.template()):
+        """``image``: the viscous operator's of a velocity field."""
+        base = self.base
+        for i in range(n):
+            ui = u[i]
+            self.image[i] = ui
+            if ti.static(self.structure.no_slip):
+                self.image[i] += dtnu * base.drag(base.x[i], ui, False)
+        for i in range(n):
+            ui, total = u[i], ti.Vector.zero(ti.f32, 4)
+            for m in range(self.begin[i], self.begin[i + 1]):
+                j = self.near[m]
+                G = self.gradient[m]
+                p = (ui - u[j]) * G
+                f = (dtnu * self.drag[m] * (p[0] + p[1] + p[2])) * G
+                total += f
+                self.image[j] -= f
+            self.image[i] += total
+        for i in range(n):
+            self.image[i][3] = 0.0
+
+    @ti.func
+    def thicken(self, n, dt, most):
+        """Implicit viscosity; returns the iterations and the residual that is left, relative."""
+        base = self.base
+        dtnu = dt * base.number[base.VISCOSITY]
+        self.viscous_image(n, dtnu, base.v)
+        size, error = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
+        for i in range(n):
+            b = base.v[i]
+            b[3] = 0.0
+            if ti.static(self.structure.no_slip):
+                b += dtnu * base.drag(base.x[i], b, True)
+            r = b - self.image[i]
+            self.residual[i], self.search[i] = r, r
+            size += ti.cast(b.norm_sqr(), ti.f64)
+            error += ti.cast(r.norm_sqr(), ti.f64)
+        goal, iterations = ti.static(VISCOUS_ERROR**2) * size, 0
+        while iterations < most and error > goal:
+            self.viscous_image(n, dtnu, self.search)
+            power = ti.cast(0.0, ti.f64)
+            for i in range(n):
+                power += ti.cast(self.search[i].dot(self.image[i]), ti.f64)
+            step, left = ti.cast(error / power, ti.f32), ti.cast(0.0, ti.f64)
+            for i in range(n):
+                base.v[i] += step * self.search[i]
+                r = self.residual[i] - step * self.image[i]
+                self.residual[i] = r
+                left += ti.cast(r.norm_sqr(), ti.f64)
+            turn = ti.cast(left / error, ti.f32)
+            for i in range(n):
+                self.search[i] = self.residual[i] + turn * self.search[i]
+            error = left
+            iterations += 1
+        return iterations, ti.cast(ti.sqrt(error / ti.max(size, 1e-300)), ti.f32)
+
+    @ti.func
+    def smooth(self, n):
+        """XSPH (Monaghan 1989): u_i += xsph sum_j V W (u_j - u_i); momentum is kept."""
+        base = self.base
+        share = base.number[base.XSPH]
+        for i in range(n):
+            self.push[i] = ti.Vector.zero(ti.f32, 4)
+        for i in range(n):
+            ui, total = base.v[i], ti.Vector.zero(ti.f32, 4)
+            for m in range(self.begin[i], self.begin[i + 1]):
+                j = self.near[m]
+                f = self.gradient[m][3] * (base.v[j] - ui)
+                total += f
+                self.push[j] -= f
+            self.push[i] += total
+        for i in range(n):
+            base.v[i] += share * self.push[i]
 
     @ti.func
     def limit(self, n, g):
@@ -179,6 +312,12 @@ class DFSPH:
             if which == 1:
                 for i in range(n):
                     base.v[i] += dt * g
+                if ti.static(self.structure.xsph):
+                    self.smooth(n)
+                if ti.static(self.structure.viscous):
+                    taken, left = self.thicken(n, dt, ti.cast(base.number[base.ITERATIONS], ti.i32))
+                    report[base.THICKENED] += ti.cast(taken, ti.f64)
+                    report[base.UNSOLVED] += ti.cast(not left <= VISCOUS_ERROR, ti.f64)
             tolerance = ti.select(which == 1, base.number[base.DENSITY_ERROR], base.number[base.DIVERGENCE_ERROR])
             iterations, error = self.solve(n, which, dt, tolerance, ti.cast(base.number[base.ITERATIONS], ti.i32))
             report[base.SOLVED + which] += ti.cast(iterations, ti.f64)

@@ -17,7 +17,7 @@ from sim.mpm.decomposition import finite
 from sim.scene import Incompressible, Scene
 from sim.simulator import Kind, SimulationError, Start
 from sim.sph.dfsph import DFSPH
-from sim.sph.kernel import ENTRIES, SHARE, SLOPE, constant, lattice_scale, wall_table
+from sim.sph.kernel import DRAG, ENTRIES, SHARE, SLOPE, constant, lattice_scale, viscous_scale, wall_table
 from sim.sph.neighbours import FEWEST, SKIN, Neighbours
 from sim.sph.wcsph import WCSPH
 from sim.taichi_runtime import compiling, start_taichi, ti
@@ -26,6 +26,10 @@ from sim.taichi_runtime import compiling, start_taichi, ti
 MAX_HALVINGS = 6
 #: Steps of a frame at most, as a multiple of those planned at its start: speeds that run away shorten steps for ever.
 MOST_STEPS = 64
+#: Share of the box from which on water counts as filling it, without a free surface.
+FULL = 0.999
+#: Distance to a wall in support radii from which on its drag grows no more.
+CLOSEST = 0.1
 #: Distance from a wall, in support radii, at which particles are stopped.
 HAIR = 1e-4
 #: Room in the list of pairs, as a multiple of those of a lattice at rest.
@@ -40,8 +44,10 @@ class Structure:
     method: str
     periodic: tuple[bool, ...]
     no_slip: bool
+    viscous: bool
     shifting: bool
-    shaken: bool
+    xsph: bool
+    full: bool
 
 
 def _capacity(particles: int) -> int:
@@ -55,11 +61,11 @@ class _Kernels:
     """Fields and compiled code for one ``Structure``."""
 
     #: Places in ``number``.
-    (COUNT, VOLUME, KERNEL, SPACING, CFL, SOUND, GAMMA, VISCOSITY, ALPHA, DELTA, DENSITY_ERROR, DIVERGENCE_ERROR, ITERATIONS, WARM,
-     NUMBERS) = range(15)
+    (COUNT, VOLUME, KERNEL, SPACING, CFL, SOUND, GAMMA, VISCOSITY, ALPHA, DELTA, DENSITY_ERROR, DIVERGENCE_ERROR, ITERATIONS, THICKNESS, XSPH,
+     NUMBERS) = range(16)
     #: Places in a frame's report; gravity and the frame's length are read from it.
-    STEPS, STEP, SPEED, SOLVED, ERROR, UNSOLVED, KINETIC, POTENTIAL, ELASTIC, DENSEST, BROKEN, FULL, LISTED, GRAVITY, SPAN, CAP, REPORT = (
-        0, 1, 2, 3, 5, 7, 8, 9, 10, 11, 12, 13, 14, 15, 18, 19, 20)
+    STEPS, STEP, SPEED, SOLVED, ERROR, UNSOLVED, KINETIC, POTENTIAL, ELASTIC, DENSEST, BROKEN, FULL, LISTED, THICKENED, GRAVITY, SPAN, CAP, REPORT = (
+        0, 1, 2, 3, 5, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16, 19, 20, 21)
 
     def __init__(self, structure: Structure, capacity: int, cells: int, pairs: int):
         self.structure, self.capacity, self.dim, self.periodic = structure, capacity, structure.dim, structure.periodic
@@ -111,6 +117,23 @@ class _Kernels:
                 fluid *= 1.0 - T[SHARE]
         gradient[3] = 1.0 - fluid
         return gradient
+
+    @ti.func
+    def drag(self, x, u, walls: ti.template()):
+        """What sticky walls take from a velocity u at x, over the viscosity; or (``walls``) what they give by their own velocities."""
+        taken = ti.Vector.zero(ti.f32, 4)
+        fluid = 1.0 - self.walls(x)[3]
+        for f in ti.static(range(self.faces)):
+            s, n = self.face(x, f)
+            if s < 1.0:
+                T = self.look(s)
+                w = u
+                if ti.static(walls):
+                    w = self.slide[f]
+                along = w - (w[0] * n[0] + w[1] * n[1] + w[2] * n[2]) * n
+                along[3] = 0.0
+                taken += (fluid / (1.0 - T[SHARE]) * T[DRAG] / ti.max(s, CLOSEST)) * along
+        return taken
 
     @ti.func
     def enclose(self, i):
@@ -200,7 +223,7 @@ class _Kernels:
 
     @ti.kernel
     def load(self, data: ti.types.ndarray(ti.f32, 2), numbers: ti.types.ndarray(ti.f32, 2), table: ti.types.ndarray(ti.f32, 2)):
-        """Positions and velocities [n, 2 dim]; numbers [4 + faces, 15]: ``number``; extent (lower, upper); cells and 1 / their widths; slides."""
+        """Positions and velocities [n, 2 dim]; numbers [4 + faces, 16]: ``number``; extent (lower, upper); cells and 1 / their widths; slides."""
         ti.loop_config(serialize=True)
         for _ in range(1):
             for k in range(self.NUMBERS):
@@ -259,8 +282,12 @@ class SPHSimulator:
     # -- what a scene needs
     def _structure(self, scene: Scene) -> Structure:
         periodic = tuple(axis in scene.periodic for axis in "xyz"[: scene.dim])
-        shifting = scene.solver.method == "wcsph" and scene.solver.shifting
-        return Structure(scene.dim, scene.solver.method, periodic, scene.walls.friction == "sticky", shifting, scene.container is not None)
+        solver, viscous = scene.solver, self._water(scene).viscosity > 0
+        shifting, xsph = getattr(solver, "shifting", False), getattr(solver, "xsph", 0) > 0
+        lower, upper = np.array(scene.bounds).T
+        water = len(scene.particles(1).position) * scene.spacing**scene.dim
+        full = solver.method == "dfsph" and water > FULL * np.prod(upper - lower)
+        return Structure(scene.dim, solver.method, periodic, viscous and scene.walls.friction == "sticky", viscous, shifting, xsph, full)
 
     def _refine(self, scene: Scene) -> int:
         return scene.refine if self.settings["particles"] == "teacher" else 1
@@ -287,10 +314,10 @@ class SPHSimulator:
         d = spacing / support
         row[k.VOLUME], row[k.KERNEL], row[k.SPACING] = d**dim, constant(dim) * lattice_scale(dim, d), d
         row[k.CFL] = self.settings["cfl"] or scene.cfl
-        row[k.VISCOSITY] = water.viscosity / water.density / support**2
+        row[k.VISCOSITY], row[k.THICKNESS] = water.viscosity / water.density / support**2, viscous_scale(dim, d)
         if isinstance(solver, Incompressible):
             row[k.DENSITY_ERROR], row[k.DIVERGENCE_ERROR] = (self.settings["tolerance"] * e for e in (solver.density_error, solver.divergence_error))
-            row[k.ITERATIONS], row[k.WARM] = solver.iterations, 1.0
+            row[k.ITERATIONS], row[k.XSPH] = solver.iterations, solver.xsph
         else:
             row[k.SOUND] = water.sound_speed * np.sqrt(self.settings["stiffness"]) / support
             row[k.GAMMA], row[k.ALPHA], row[k.DELTA] = water.gamma, solver.artificial_viscosity, solver.density_diffusion
@@ -363,6 +390,8 @@ class SPHSimulator:
                 "iterations_divergence": report[k.SOLVED], "iterations_density": report[k.SOLVED + 1], "divergence_error": report[k.ERROR],
                 "density_error": report[k.ERROR + 1], "unsolved": report[k.UNSOLVED],
             }
+            if self._kernels.structure.viscous:
+                self._diagnostics["iterations_viscosity"] = report[k.THICKENED]
         return report
 
     def frame(self) -> np.ndarray:

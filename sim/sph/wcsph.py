@@ -1,10 +1,10 @@
 """Weakly compressible SPH (Monaghan 1994) with density diffusion (Fourtakas et al. 2019) and particle shifting (Lind et al. 2012; Sun et al. 2017).
 
     d rho_i / dt = sum_j V (u_i - u_j) . grad W_ij + 2 delta h c sum_j V (rho_j - rho_i - rho_H) |W'| / r
-    d u_i / dt   = -sum_j V (P_i + P_j) grad W_ij + g - sum_j V (2 (dim + 2) nu + alpha h c) (u_ij . r_ij) r_ij |W'| / r^3
+    d u_i / dt   = -sum_j V (P_i + P_j) grad W_ij + g - sum_j (nu A f + V alpha h c |W'| / r) (u_ij . r_ij) r_ij / r^2
     P = p / rho^2,  p = (c^2 / gamma) (rho^gamma - 1),  rho_H = g . (x_j - x_i) / c^2,  h = 1/2
 
-with densities over that at rest. The artificial viscosity alpha acts on what approaches. Walls (``sim.sph.kernel``) continue the fluid:
+with densities over that at rest, f and A of ``sim.sph.kernel.viscous_weight``. The artificial viscosity alpha acts on what approaches. Walls (``sim.sph.kernel``) continue the fluid:
 the pressure across them by P_i + g . (x' - x_i) (Adami et al. 2012), no suction, and along them by the fluid's own gradient, which the particle's
 neighbours show on its own side only (TANGENT). Left out, water at a vertical wall hangs on less than its pressure and sinks.
 
@@ -13,13 +13,11 @@ Shifting moves particles down the gradient of their concentration, by 2 max|u| d
 Time: velocity Verlet with predicted velocity and density (Springel 2005, section 4.2), one sweep over the pairs a step.
 """
 
-from sim.sph.kernel import DRAG, NORMAL, SHARE, SLOPE, SPREAD, TANGENT
+from sim.sph.kernel import NORMAL, SHARE, SLOPE, SPREAD, TANGENT
 from sim.taichi_runtime import ti
 
 #: Particles count as inside the fluid where sum_j V r . grad W exceeds this share of the dimension (Lee et al. 2008: 1.5 of 2).
 INSIDE = 0.75
-#: Distance to a wall in support radii from which on its drag grows no more.
-CLOSEST = 0.1
 
 
 @ti.data_oriented
@@ -35,7 +33,7 @@ class WCSPH:
             self.crowd = ti.Vector.field(4, ti.f32, capacity)  # gradient of the concentration; lane 3: minus the divergence of position
             self.state.append(self.crowd)
         if self.structure.no_slip:
-            self.rub = ti.Vector.field(4, ti.f32, capacity)  # viscous acceleration, apart from that by pressures
+            self.rub = ti.Vector.field(4, ti.f32, capacity)  # minus the viscous acceleration, apart from that by pressures
 
     @ti.func
     def sweep(self, n, g):
@@ -43,7 +41,7 @@ class WCSPH:
         base = self.base
         V, K, c = base.number[base.VOLUME], base.number[base.KERNEL], base.number[base.SOUND]
         gamma, delta = base.number[base.GAMMA], 2.0 * base.number[base.DELTA] * 0.5 * c
-        alpha, nu = 0.5 * base.number[base.ALPHA] * c, 2.0 * (self.dim + 2) * base.number[base.VISCOSITY]
+        alpha, nu = 0.5 * base.number[base.ALPHA] * c, base.number[base.THICKNESS] * base.number[base.VISCOSITY]
         for i in range(n):
             rho = base.v[i][3]
             base.x[i][3] = c * c / gamma * (ti.pow(rho, gamma) - 1.0) / (rho * rho)
@@ -68,21 +66,21 @@ class WCSPH:
                 t = 1.0 - ti.sqrt(ti.min(q2, 1.0))
                 q = scale * t * t * t  # V |W'| / r
                 ur = u * r
-                closing = ur[0] + ur[1] + ur[2]
+                parting = ur[0] + ur[1] + ur[2]
                 fall = slant * r
                 D = q * delta * (fall[0] + fall[1] + fall[2] - jump)
-                S = (nu * closing + alpha * ti.min(closing, 0.0)) / (q2 + 1e-4)
-                F = (q * P) * r
-                if ti.static(self.structure.no_slip):
-                    f = (q * S) * r
-                    R += f
-                    self.rub[j] -= f
-                else:
-                    F -= (q * S) * r
+                F = (q * (P - alpha * ti.min(parting, 0.0) / (q2 + 1e-4))) * r
+                if ti.static(self.structure.viscous):
+                    f = (nu * t * ti.sqrt(t) * parting / (q2 + 1e-4)) * r
+                    if ti.static(self.structure.no_slip):
+                        R += f
+                        self.rub[j] -= f
+                    else:
+                        F -= f
                 # The continuity equation's part is the same for both, the diffusion's the opposite.
-                F[3] = D - q * closing
+                F[3] = D - q * parting
                 A += F
-                F[3] = D + q * closing
+                F[3] = D + q * parting
                 self.rate[j] -= F
                 if ti.static(self.structure.shifting):
                     C = -q * r
@@ -128,16 +126,12 @@ class WCSPH:
                     un, gn = u[0] * n[0] + u[1] * n[1] + u[2] * n[2], g[0] * n[0] + g[1] * n[1] + g[2] * n[2]
                     A -= (weight * (2.0 * P * T[SLOPE] + gn * T[NORMAL])) * n
                     A[3] += weight * T[SLOPE] * un
-                    if ti.static(self.structure.no_slip):
-                        slip = u - un * n - base.slide[f]
-                        slip[3] = 0.0
-                        A -= (base.number[base.VISCOSITY] * weight * T[DRAG] / ti.max(s, CLOSEST)) * slip
                     if ti.static(self.structure.shifting):
                         C = T[SLOPE] * n
                         C[3] = T[SPREAD]
                         self.crowd[i] += weight * C
         if ti.static(self.structure.no_slip):
-            A -= self.rub[i]
+            A -= self.rub[i] + base.number[base.VISCOSITY] * (base.drag(x, u, False) - base.drag(x, u, True))
         self.rate[i] = A + g
 
     @ti.func
