@@ -19,6 +19,7 @@ from sim.solvers import solver_class
 RATES = {
     (2, "water"): 10e6, (2, "sand"): 12e6, (2, "goop"): 11e6, (2, "elastic"): 15e6, (2, "snow"): 8.5e6, (2, "rigid"): 10e6,
     (3, "water"): 15e6, (3, "sand"): 2.7e6, (3, "goop"): 2.7e6, (3, "elastic"): 9e6, (3, "snow"): 2.7e6, (3, "rigid"): 15e6,
+    (2, "wcsph"): 3.5e6, (3, "wcsph"): 1.5e6, (2, "dfsph"): 2e6, (3, "dfsph"): 1.2e6,
 }
 
 #: Scenes drawn to describe a family.
@@ -52,7 +53,7 @@ def plan(family: SceneFamily) -> Plan:
     recorded, particles = (float(np.mean([each[key] for each in plans])) for key in ("recorded", "particles"))
     substeps = np.mean([each["substeps_per_frame"] for each in plans], axis=0)
     work = particles * float(substeps.mean()) * (model.frames - 1)
-    rate = min(RATES[model.dim, material] for material in plans[0]["materials"])
+    rate = min(RATES[model.dim, name] for name in plans[0]["rates"])
     return Plan(
         solver=max(plans, key=lambda each: each["bytes"]), recorded=recorded, particles=particles, substeps=(round(substeps[0]), round(substeps[1])),
         particle_substeps=work, rate=rate, seconds=work / rate, disk=4.0 * model.frames * recorded * model.dim,
@@ -103,7 +104,7 @@ def plan_text(family: SceneFamily, jobs: int = 1) -> str:
     found, model = plan(family), family.model
     solver = found.solver
     lines = [
-        f"scene {model.name}: MLS-MPM, {solver['dim']}D, {', '.join(solver['materials'])}, {solver['walls']} walls",
+        f"scene {model.name}: {solver['title']}, {solver['dim']}D, {', '.join(solver['materials'])}, {solver['walls']} walls",
         f"  particles: {found.recorded:.0f} recorded, {found.particles:.0f} simulated (mean of {_SAMPLES} draws); "
         f"{' x '.join(map(str, solver['cells']))} cells of {solver['grid_spacing']:.4g}",
         *([f"  obstacles: {solver['obstacles']} in the largest draw, {solver['kinematic']} of its recorded particles are kinematic"]

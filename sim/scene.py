@@ -321,6 +321,10 @@ class _Physics(_Strict):
                 raise _mistake(where, velocity, f"must be the velocity of a wall of this box, {self.dim} entries, none through the wall itself")
         if method != "mpm" and self.walls.friction not in (0, "sticky"):
             raise _mistake("walls.friction", self.walls.friction, "SPH walls slip (0) or hold viscous water (sticky); MPM has Coulomb friction")
+        for index, obstacle in enumerate(getattr(self, "obstacles", [])):
+            if method != "mpm" and obstacle.friction not in (None, self.walls.friction):
+                remedy = "in SPH scenes obstacles slip or hold water as the walls do; leave it out"
+                raise _mistake(f"obstacles[{index}].friction", obstacle.friction, remedy)
         for name, material in self.materials.items():
             if method != "mpm" and material.model not in ("water", "rigid"):
                 raise _mistake(f"materials.{name}.model", material.model, "SPH moves water and rigid bodies; MPM (leave solver out) all materials")

@@ -1052,7 +1052,8 @@ class MPMSimulator:
         wave_speed, _ = self._at_start(scene, 0.0)
         substeps = [self._substeps(scene, dx, wave_speed, v + gravity * scene.frame_step) for v in (0.0, fall)]
         return {
-            "dim": dim, "materials": [name for name, *_ in models], "walls": friction, "obstacles": len(scene.obstacles),
+            "title": "MLS-MPM", "dim": dim, "materials": [name for name, *_ in models], "rates": [name for name, *_ in models], "walls": friction,
+            "obstacles": len(scene.obstacles),
             "context": 0 if context is None else context.shape[1], "kernels": kernels, "fields": fields, "left_out": left_out,
             "bytes": sum(size * count for size, count in fields.values()), "particles": len(particles.position),
             "recorded": len(particles.tracked) + len(scene.boundary), "kinematic": len(scene.boundary), "cells": cells.tolist(),

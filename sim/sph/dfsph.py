@@ -12,8 +12,9 @@ An iteration is two sweeps over the pairs, whose gradients are stored: they, not
 before. A solve ends when its mean error over all particles is below ``density_error`` (``divergence_error``), after at least ``LEAST``
 iterations and at most ``iterations``; one that did not end so is counted, and its frame is repeated with half the step.
 
-Without a free surface (``full``: the water fills its box) nothing can expand: densities are then held to their mean, from both sides. That is a linear
-system with a symmetric matrix and takes conjugate gradients: pressures reach across the whole box, and Jacobi's iterations only a particle each.
+Without a free surface (``full``: the water fills its box) nothing can expand: densities are then held to their mean, from both sides. That is a
+linear system with a symmetric matrix and takes conjugate gradients: pressures reach across the whole box, and Jacobi's iterations only a
+particle each.
 
 Viscosity is implicit, whatever its size: conjugate gradients for u + dt nu A sum_j f (u_ij . r_ij) r_ij / r^2 = u* (Weiler et al. 2018; f and A:
 ``sim.sph.kernel.viscous_weight``). Each pair's force is along its line, so angular momentum is kept.

@@ -14,6 +14,7 @@ import numpy as np
 
 from sim.errors import InputError
 from sim.mpm.decomposition import finite
+from sim.obstacles import combine
 from sim.scene import Incompressible, Scene
 from sim.simulator import Kind, SimulationError, Start
 from sim.sph.dfsph import DFSPH
@@ -48,6 +49,7 @@ class Structure:
     shifting: bool
     xsph: bool
     full: bool
+    obstacles: bool
 
 
 def _capacity(particles: int) -> int:
@@ -67,14 +69,17 @@ class _Kernels:
     STEPS, STEP, SPEED, SOLVED, ERROR, UNSOLVED, KINETIC, POTENTIAL, ELASTIC, DENSEST, BROKEN, FULL, LISTED, THICKENED, GRAVITY, SPAN, CAP, REPORT = (
         0, 1, 2, 3, 5, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16, 19, 20, 21)
 
-    def __init__(self, structure: Structure, capacity: int, cells: int, pairs: int):
+    def __init__(self, structure: Structure, capacity: int, cells: int, pairs: int, nodes: tuple[int, ...]):
         self.structure, self.capacity, self.dim, self.periodic = structure, capacity, structure.dim, structure.periodic
         self.number = ti.field(ti.f32, self.NUMBERS)
         self.x, self.v = (ti.Vector.field(4, ti.f32, capacity) for _ in range(2))
         self.id = ti.field(ti.i32, capacity)
         self.extent = ti.Vector.field(4, ti.f32, 2)
         self.table = ti.Vector.field(6, ti.f32, ENTRIES + 2)
-        self.faces = 2 * self.dim
+        # The walls, and the obstacles as one more.
+        self.faces = 2 * self.dim + structure.obstacles
+        if structure.obstacles:
+            self.solids = ti.Vector.field(self.dim + 1, ti.f32, nodes)  # normal and distance [support radii], a spacing apart
         self.slide = ti.Vector.field(4, ti.f32, self.faces)
         self.neighbours = Neighbours(self.dim, capacity, cells, pairs, self.periodic)
         self.scheme = (DFSPH if structure.method == "dfsph" else WCSPH)(self, capacity, pairs)
@@ -95,12 +100,34 @@ class _Kernels:
     def face(self, x, f: ti.template()):
         """Distance to a wall and the normal away from it; 2 for one that is not there."""
         s, n = 2.0, ti.Vector.zero(ti.f32, 4)
-        if ti.static(not self.periodic[f // 2]):
+        if ti.static(f == 2 * self.dim):
+            s, n = self.clearance(x)
+        elif ti.static(not self.periodic[f // 2]):
             if ti.static(f % 2 == 0):
                 s, n[f // 2] = x[f // 2] - self.extent[0][f // 2], 1.0
             else:
                 s, n[f // 2] = self.extent[1][f // 2] - x[f // 2], -1.0
         return s, n
+
+    @ti.func
+    def clearance(self, x):
+        """Distance to the obstacles and unit normal, multilinear in the nodes' values."""
+        low, f = ti.Vector.zero(ti.i32, self.dim), ti.Vector.zero(ti.f32, self.dim)
+        for d in ti.static(range(self.dim)):
+            u = x[d] / self.number[self.SPACING]
+            low[d] = ti.min(ti.max(ti.cast(u, ti.i32), 0), ti.static(self.solids.shape[d] - 2))
+            f[d] = u - ti.cast(low[d], ti.f32)
+        n, s = ti.Vector.zero(ti.f32, 4), 0.0
+        for corner in ti.static(range(2**self.dim)):
+            at, weight = low, 1.0
+            for d in ti.static(range(self.dim)):
+                at[d] += ti.static(corner >> d & 1)
+                weight *= f[d] if ti.static(corner >> d & 1) else 1.0 - f[d]
+            value = self.solids[at]
+            s += weight * value[self.dim]
+            for d in ti.static(range(self.dim)):
+                n[d] += weight * value[d]
+        return s, n / ti.max(n.norm(), 1e-6)
 
     @ti.func
     def walls(self, x):
@@ -148,6 +175,14 @@ class _Kernels:
                     self.v[i][d] = 0.0
                 if finite(x[d]):
                     x[d] = inside
+        if ti.static(self.structure.obstacles):
+            s, n = self.clearance(x)
+            if s < HAIR:
+                u = self.v[i]
+                inward = ti.min(u[0] * n[0] + u[1] * n[1] + u[2] * n[2], 0.0)
+                self.v[i] = u - inward * n
+                for d in ti.static(range(self.dim)):
+                    x[d] = ti.min(ti.max(x[d] + (HAIR - s) * n[d], self.extent[0][d] + HAIR), self.extent[1][d] - HAIR)
         self.x[i] = x
 
     # -- pairs
@@ -251,6 +286,16 @@ class _Kernels:
             self.neighbours.count[None] = 0
 
     @ti.kernel
+    def load_solids(self, values: ti.types.ndarray(ti.f32, 2)):
+        """[nodes, dim + 1] in the order of the indices."""
+        for I in ti.grouped(self.solids):
+            row = 0
+            for d in ti.static(range(self.dim)):
+                row = row * ti.static(self.solids.shape[d]) + I[d]
+            for lane in ti.static(range(self.dim + 1)):
+                self.solids[I][lane] = values[row, lane]
+
+    @ti.kernel
     def restore(self, n: ti.i32):
         ti.loop_config(serialize=True)
         for _ in range(1):
@@ -287,7 +332,8 @@ class SPHSimulator:
         lower, upper = np.array(scene.bounds).T
         water = len(scene.particles(1).position) * scene.spacing**scene.dim
         full = solver.method == "dfsph" and water > FULL * np.prod(upper - lower)
-        return Structure(scene.dim, solver.method, periodic, viscous and scene.walls.friction == "sticky", viscous, shifting, xsph, full)
+        no_slip = viscous and scene.walls.friction == "sticky"
+        return Structure(scene.dim, solver.method, periodic, no_slip, viscous, shifting, xsph, full, bool(scene.obstacles))
 
     def _refine(self, scene: Scene) -> int:
         return scene.refine if self.settings["particles"] == "teacher" else 1
@@ -302,6 +348,11 @@ class SPHSimulator:
             if axis in scene.periodic and count < FEWEST:
                 remedy = f"the box is too narrow there for its particles: {FEWEST} kernels must fit; use more cells"
                 raise InputError(scene.name, "periodic", axis, remedy)
+        for index, obstacle in enumerate(scene.obstacles):
+            thickness = getattr(obstacle, "thickness", np.inf)
+            if thickness < support:
+                remedy = f"thinner than the kernel's radius {support:.4g}: water on its two sides would interact; thicken it or use more cells"
+                raise InputError(scene.name, f"obstacles[{index}].thickness", thickness, remedy)
         return spacing, support, cells
 
     def _numbers(self, scene: Scene) -> np.ndarray:
@@ -309,7 +360,7 @@ class SPHSimulator:
         spacing, support, cells = self._layout(scene)
         lower, upper = np.array(scene.bounds).T
         dim, water, solver, k = scene.dim, self._water(scene), scene.solver, _Kernels
-        numbers = np.zeros((4 + 2 * dim, max(k.NUMBERS, 8)))
+        numbers = np.zeros((5 + 2 * dim, k.NUMBERS))
         row = numbers[0]
         d = spacing / support
         row[k.VOLUME], row[k.KERNEL], row[k.SPACING] = d**dim, constant(dim) * lattice_scale(dim, d), d
@@ -330,24 +381,112 @@ class SPHSimulator:
     def _water(self, scene: Scene):
         return next(material for material in scene.materials.values() if material.model == "water")
 
+    def _sizes(self, scene: Scene, structure: Structure, particles: int) -> tuple[int, int, int, tuple[int, ...]]:
+        """Room for particles, cells and pairs; nodes of the signed distance."""
+        spacing, _, cells = self._layout(scene)
+        capacity = _capacity(particles)
+        reach = scene.solver.support * (1 + SKIN)
+        pairs = int(ROOM * {2: np.pi, 3: 4 * np.pi / 3}[scene.dim] * reach**scene.dim / 2 * capacity) + 4096
+        lower, upper = np.array(scene.bounds).T
+        nodes = tuple(int(np.ceil(length - 1e-6)) + 1 for length in (upper - lower) / spacing) if structure.obstacles else ()
+        return capacity, int(np.prod(cells + 2)), pairs, nodes
+
+    def limits(self, scene: Scene, speed: float) -> dict[str, float]:
+        """Bounds on the time step [s] at a speed of particles [m/s], by what sets them (h: half the support radius).
+
+        WCSPH: cfl spacing / (c + |v|), h^2 / (8 nu), sqrt(h / |g|) / 4 (Monaghan 1992). DFSPH: |v| dt + |g| dt^2 = cfl spacing.
+        """
+        spacing, support, _ = self._layout(scene)
+        tiny, gravity = np.finfo(float).tiny, float(np.linalg.norm(np.array(scene.gravity) - scene.acceleration(), axis=-1).max())
+        way, water = (self.settings["cfl"] or scene.cfl) * spacing, self._water(scene)
+        if scene.solver.method == "dfsph":
+            return {"the Courant number": 2 * way / max(speed + np.sqrt(speed**2 + 4 * gravity * way), tiny)}
+        sound = water.sound_speed * np.sqrt(self.settings["stiffness"])
+        return {
+            "the Courant number": way / (sound + speed), "the viscosity": (support / 2) ** 2 / 8 / max(water.viscosity / water.density, tiny),
+            "gravity": 0.25 * np.sqrt(support / 2 / max(gravity, tiny)),
+        }  # fmt: skip
+
+    def _substeps(self, scene: Scene, speed: float) -> int:
+        step = min(self.limits(scene, speed).values())
+        if scene.time_step is not None and not self.settings["cfl"]:
+            step = scene.time_step
+        return max(1, int(np.ceil(scene.frame_step / step - 1e-6)))
+
+    def check_time_step(self, scene: Scene, where: object) -> None:
+        """Refuse a fixed time step above the limit at the bodies' own speeds. Raises ``InputError``."""
+        if scene.time_step is None or self.settings["cfl"]:
+            return
+        speed = max(float(np.linalg.norm(body.velocity)) for body in scene.bodies)
+        limits = self.limits(scene, speed)
+        what = min(limits, key=limits.get)
+        if scene.time_step > limits[what] * (1 + 1e-6):
+            steps = int(np.ceil(scene.frame_step / limits[what]))
+            remedy = (f"above the limit {limits[what]:.4g} s, which {what} sets (cfl {scene.cfl:g}, speed {speed:.3g} m/s); use at most "
+                      f"{scene.frame_step / steps:.8g}, {steps} steps a frame, or leave it out: adaptive")
+            raise InputError(where, "time_step", scene.time_step, remedy)
+
+    def plan(self, scene: Scene) -> dict:
+        """What ``load`` would build for a scene, without building it; see ``MPMSimulator.plan``."""
+        structure, (_, support, cells) = self._structure(scene), self._layout(scene)
+        dim, method, particles = scene.dim, scene.solver.method, scene.particles(self._refine(scene))
+        n, boxes, pairs, nodes = self._sizes(scene, structure, len(particles.position))
+        state = {"x": 16, "v": 16} | ({"pressure": 8} if method == "dfsph" else {"rate": 16, "rate before": 16})
+        state |= {"crowd": 16} if structure.shifting else {}
+        fields = {name: (size, n) for name, size in state.items()} | {f"moved {name}": (size, n) for name, size in state.items()}
+        fields |= {f"saved {name}": (size, n) for name, size in state.items()} | {f"{name}id": (4, n) for name in ("", "moved ", "saved ")}
+        fields |= {"cell": (4, n), "sorted place": (4, n), "first pair": (4, n), "place when listed": (16, n), "pairs": (4, pairs),
+                   "cells": (8, boxes)}
+        if method == "dfsph":
+            fields |= {"pairs within reach": (4, pairs), "gradients": (16, pairs), "sums": (16, n), "wall": (16, n), "push": (16, n)}
+            fields |= {"source": (4, n), "members": (4, n), "first within reach": (4, n)}
+        fields |= {"krylov": (8, n)} if structure.full else {}
+        if structure.viscous and method == "dfsph":
+            fields |= {"drag": (4, pairs), "residual": (16, n), "search": (16, n), "image": (16, n)}
+        fields |= {"rub": (16, n)} if structure.no_slip and method == "wcsph" else {}
+        fields |= {"signed distance": (4 * (dim + 1), int(np.prod(nodes)))} if structure.obstacles else {}
+        context = scene.context_values()
+        reasons = {
+            "third dimension": "a 2D scene" if dim == 2 else None, "viscosity": None if structure.viscous else "inviscid water",
+            "wall friction": None if structure.no_slip else "inviscid water" if scene.walls.friction == "sticky" else "slip walls",
+            "signed distance": None if structure.obstacles else "no obstacles",
+            "periodic images": None if any(structure.periodic) else "walls all around",
+            "context": "no moving container, no varying parameter" if context is None else None,
+            "equation of state": "incompressible" if method == "dfsph" else None,
+            "pressure solves": "weakly compressible" if method == "wcsph" else None,
+            "particle shifting": None if structure.shifting or method == "dfsph" else "shifting: false",
+            "pressure of either sign": None if structure.full or method == "wcsph" else "a free surface", "grid": "particles meet in pairs",
+        }
+        gravity = float(np.linalg.norm(np.array(scene.gravity) - scene.acceleration(), axis=1).max())
+        start = float(np.sqrt((particles.velocity**2).sum(1).max()))
+        fall = float(np.sqrt(start**2 + 2 * gravity * np.linalg.norm(np.ptp(scene.bounds, axis=1))))
+        water = self._water(scene)
+        return {
+            "title": {"wcsph": "weakly compressible SPH", "dfsph": "divergence-free SPH"}[method], "dim": dim, "rates": [method],
+            "materials": [material.model for material in scene.materials.values()],
+            "walls": "sticky" if structure.no_slip else "slip",
+            "obstacles": len(scene.obstacles), "context": 0 if context is None else context.shape[1],
+            "kernels": ["load", "frame", "restore"] + ["load_solids"] * structure.obstacles, "fields": fields,
+            "left_out": {what: why for what, why in reasons.items() if why}, "bytes": sum(size * count for size, count in fields.values()),
+            "particles": len(particles.position), "recorded": len(particles.tracked) + len(scene.boundary), "kinematic": len(scene.boundary),
+            "cells": cells.tolist(), "grid_spacing": support * (1 + SKIN), "wave_speed": water.sound_speed if method == "wcsph" else 0.0,
+            "substeps_per_frame": [self._substeps(scene, speed + gravity * scene.frame_step) for speed in (0.0, fall)],
+        }
+
     # -- state
     def load(self, scene: Scene) -> None:
         """Set the state of frame 0, compiling on first use. Raises ``InputError``."""
         begun = time.perf_counter()
         start_taichi()
-        structure, (spacing, support, cells) = self._structure(scene), self._layout(scene)
+        structure, (spacing, support, _) = self._structure(scene), self._layout(scene)
         particles = scene.particles(self._refine(scene))
         n, dim = particles.position.shape
-        capacity, boxes = _capacity(n), int(np.prod(cells + 2))
-        neighbours = {2: np.pi, 3: 4 * np.pi / 3}[dim] * (scene.solver.support * (1 + SKIN)) ** dim / 2
-        pairs = int(ROOM * neighbours * capacity) + 4096
+        sizes = self._sizes(scene, structure, n)
         built = self._built
-        if built is None or built[0] != structure or built[1] < n or built[2] < boxes or built[3] < pairs:
-            self._kernels = _Kernels(structure, capacity, boxes, pairs)
-            self._built = (structure, capacity, boxes, pairs)
-            fresh = True
-        else:
-            fresh = False
+        fits = built and built[0] == structure and built[4] == sizes[3] and all(have >= need for have, need in zip(built[1:4], sizes, strict=False))
+        if not fits:
+            self._kernels = _Kernels(structure, *sizes)
+            self._built = (structure, *sizes)
         self._scene, self._support, self._tracked = scene, support, particles.tracked
         self._boundary = scene.boundary.astype(np.float32)
         self._acceleration, self._frame = scene.acceleration(), 0
@@ -366,10 +505,14 @@ class SPHSimulator:
         table = wall_table(dim, spacing / support).astype(np.float32)
         with compiling(dim):
             self._kernels.load(data, numbers.astype(np.float32), table)
+            if structure.obstacles:
+                nodes = np.stack(np.meshgrid(*[np.arange(count) for count in sizes[3]], indexing="ij"), -1).reshape(-1, dim)
+                distance, normal, _ = combine(scene.surfaces, lower + nodes * spacing)
+                self._kernels.load_solids(np.column_stack([normal, distance / support]).astype(np.float32))
             self._run(0.0, np.inf, 0, keep=True)
-            if fresh:
+            if not fits:
                 self._kernels.restore(n)
-        if fresh:
+        if not fits:
             self.compile_seconds += time.perf_counter() - begun
 
     def _run(self, span: float, cap: float, steps: int, keep: bool) -> np.ndarray:

@@ -4,9 +4,10 @@
     d u_i / dt   = -sum_j V (P_i + P_j) grad W_ij + g - sum_j (nu A f + V alpha h c |W'| / r) (u_ij . r_ij) r_ij / r^2
     P = p / rho^2,  p = (c^2 / gamma) (rho^gamma - 1),  rho_H = g . (x_j - x_i) / c^2,  h = 1/2
 
-with densities over that at rest, f and A of ``sim.sph.kernel.viscous_weight``. The artificial viscosity alpha acts on what approaches. Walls (``sim.sph.kernel``) continue the fluid:
-the pressure across them by P_i + g . (x' - x_i) (Adami et al. 2012), no suction, and along them by the fluid's own gradient, which the particle's
-neighbours show on its own side only (TANGENT). Left out, water at a vertical wall hangs on less than its pressure and sinks.
+with densities over that at rest, f and A of ``sim.sph.kernel.viscous_weight``. The artificial viscosity alpha acts on what approaches. Walls
+(``sim.sph.kernel``) continue the fluid: the pressure across them by P_i + g . (x' - x_i) (Adami et al. 2012), no suction, and along them by the
+fluid's own gradient, which the particle's neighbours show on its own side only (TANGENT). Left out, water at a vertical wall hangs on
+less than its pressure and sinks.
 
 Shifting moves particles down the gradient of their concentration, by 2 max|u| dt grad C (Sun et al. 2017, eq. 10), where they are inside.
 
