@@ -5,10 +5,13 @@ Tracing the kernels for Taichi takes seconds, cached or not, and the rungs of a 
 
 from __future__ import annotations
 
+import inspect
+
 import numpy as np
 
-from sim.mpm.solver import MPMSimulator
+from sim.errors import InputError
 from sim.simulator import Kind, Start
+from sim.solvers import solver_class
 
 
 class Rung:
@@ -17,7 +20,7 @@ class Rung:
     Rungs that share must be run one after the other, as ``rollout`` does: to ``begin`` one is to end the others.
     """
 
-    def __init__(self, solver: MPMSimulator, name: str, kind: Kind, settings: dict):
+    def __init__(self, solver, name: str, kind: Kind, settings: dict):
         self.solver, self.name, self.kind, self.settings = solver, name, kind, settings
 
     def begin(self, start: Start) -> None:
@@ -30,12 +33,16 @@ class Rung:
         return self.solver.advance()
 
 
-def mpm_ladder(rungs: list[tuple[str, Kind, dict]]) -> list[Rung]:
-    """Rungs (name, kind, overrides of ``MPMSimulator``), in the given order; those on one grid share a solver. Raises ``InputError``."""
-    solvers: dict[tuple, MPMSimulator] = {}
-    made = []
+def solver_ladder(rungs: list[tuple[str, Kind, dict]], method: str) -> list[Rung]:
+    """Rungs (name, kind, overrides of the method's solver), in the given order; those on one grid share a solver. Raises ``InputError``."""
+    solver, shared, made = solver_class(method), {}, []
+    known = [name for name in inspect.signature(solver).parameters if name not in ("name", "kind", "serial", "unguarded_step")]
     for name, kind, overrides in rungs:
-        settings = MPMSimulator(name=name, kind=kind, **overrides).settings
-        solver = solvers.setdefault((settings["particles"], settings["coarsen"]), MPMSimulator())
-        made.append(Rung(solver, name, kind, settings))
+        for key, value in overrides.items():
+            if key not in known:
+                raise InputError(name, key, value, f"{method} has no such setting; its are {', '.join(known)}")
+        settings = solver(name=name, kind=kind, **overrides).settings
+        place = (settings["particles"], settings.get("coarsen"))
+        shared[place] = shared.get(place) or solver()
+        made.append(Rung(shared[place], name, kind, settings))
     return made

@@ -9,7 +9,7 @@ from learn.checkpoint import load_model
 from learn.compare import CompareSettings
 from learn.dataset import Dataset
 from learn.rollout import check_fit
-from sim.ladder import mpm_ladder
+from sim.ladder import solver_ladder
 from sim.simulator import Simulator
 from sim.trajectory import Trajectory
 from workflow.names import FLOOR, REFERENCE
@@ -47,7 +47,8 @@ def contenders(study: Study, comparison: str, trajectories: list[Trajectory], ki
     rungs = [(REFERENCE, "reference", {}), *((rung["name"], "solver", rung_settings(rung)) for rung in entry["ladder"])]
     rungs.append((FLOOR, "floor", {"perturbation": PERTURBATION * trajectories[0].radius}))
     models = [contender for model in entry["learned"] for contender in learned(study, comparison, model)]
-    made = [*mpm_ladder(rungs), *models, *trivial_baselines(), Oracle(trajectories)]
+    method = trajectories[0].scene.get("solver", {}).get("method", "mpm")
+    made = [*solver_ladder(rungs, method), *models, *trivial_baselines(), Oracle(trajectories)]
     return [contender for contender in made if contender.kind in kinds]
 
 

@@ -29,7 +29,7 @@ SCHEMA = ROOT / "workflow" / "schemas" / "study.schema.json"
 #: The two parts of a data set. They are made by jobs of their own, so that more test trajectories do not mean another training.
 PARTS = {"learning": ("train", "valid"), "test": ("test",)}
 FIGURES = ("error_over_run_time", "error_over_time", "kinetic_energy")
-_RUNG_KEYS = ("cfl", "stiffness", "coarsen", "particles", "frames")
+_RUNG_KEYS = ("cfl", "stiffness", "coarsen", "particles", "frames", "tolerance")
 
 
 def _explain(error: ValidationError, path: Path) -> InputError:
@@ -289,5 +289,5 @@ def _check_comparison(study: Study, name: str, entry: dict) -> None:
 
 
 def rung_settings(rung: dict) -> dict:
-    """The overrides of ``MPMSimulator`` that a rung of the ladder names."""
+    """The overrides of the solver that a rung of the ladder names."""
     return {key: rung[key] for key in _RUNG_KEYS if key in rung}
