@@ -191,7 +191,8 @@ _Support = Annotated[Finite, _only(1.5, 4.0, "must lie in 1.5 .. 4 particle spac
 class WeaklyCompressible(_Strict):
     """Weakly compressible SPH (``sim.sph.wcsph``).
 
-    support [particle spacings]; artificial_viscosity: Monaghan's alpha; density_diffusion: delta; shifting: particles are kept evenly spread."""
+    support [particle spacings]; artificial_viscosity: Monaghan's alpha; density_diffusion: delta; shifting: particles are kept evenly spread,
+    which is what lets water bear tension where it is not at a free surface; without it, no pressure is negative."""
 
     method: Literal["wcsph"]
     support: _Support = 2.5

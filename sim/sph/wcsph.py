@@ -9,6 +9,9 @@ with densities over that at rest, f and A of ``sim.sph.kernel.viscous_weight``. 
 fluid's own gradient, which the particle's neighbours show on its own side only (TANGENT). Left out, water at a vertical wall hangs on
 less than its pressure and sinks.
 
+At a free surface and in spray there is no tension: the density of particles that are not inside does not fall below that at rest. Two
+lone particles whose pressure was negative pulled each other to pieces.
+
 Shifting moves particles down the gradient of their concentration, by 2 max|u| dt grad C (Sun et al. 2017, eq. 10), where they are inside.
 
 Time: velocity Verlet with predicted velocity and density (Springel 2005, section 4.2), one sweep over the pairs a step.
@@ -169,3 +172,7 @@ class WCSPH:
         self.sweep(n, g)
         for i in range(n):
             base.v[i] += (0.5 * dt) * (self.rate[i] - self.before[i])
+            inside = False
+            if ti.static(self.structure.shifting):
+                inside = self.crowd[i][3] > ti.static(INSIDE * self.dim)
+            base.v[i][3] = ti.select(inside, base.v[i][3], ti.max(base.v[i][3], 1.0))
