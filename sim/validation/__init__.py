@@ -16,6 +16,7 @@ from sim.scene import Scene
 CASES = (
     "rotation", "return_map", "hydrostatics", "elastic_column", "axial_bar", "cantilever", "standing_wave", "dam_break", "granular_collapse",
     "block_on_plane", "elastic_discs", "float_and_sink", "viscoplastic_slump",
+    "sloshing",
 )
 
 

@@ -34,8 +34,8 @@ def run(resolution: int) -> Outcome:
     curves = {
         "volume": Curve("loss of volume after ten seconds, relative", ("t [s]", "volume / start"), t[frames], np.ones(len(frames)), volume,
                         float(1 - volume[-1]), 0.01),
-        "density": Curve("largest mean density error of a solve over its tolerance, less 1", ("t [s]", "error / tolerance"), t, np.ones(len(t)), error,
-                         max(float(error.max()) - 1, 0.0), 0.0),
+        "density": Curve("largest mean density error of a solve over its tolerance, less 1", ("t [s]", "error / tolerance"),
+                         t, np.ones(len(t)), error, max(float(error.max()) - 1, 0.0), 0.0),
     }  # fmt: skip
     return Outcome("sloshing", resolution, len(what.particles().position), curves, seconds)
 
