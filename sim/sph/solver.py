@@ -18,7 +18,7 @@ from sim.obstacles import combine
 from sim.scene import Incompressible, Scene
 from sim.simulator import Kind, SimulationError, Start
 from sim.sph.dfsph import DFSPH
-from sim.sph.kernel import DRAG, ENTRIES, SHARE, SLOPE, constant, lattice_scale, viscous_scale, wall_table
+from sim.sph.kernel import DRAG, ENTRIES, NORMAL, SHARE, SLOPE, SPREAD, TANGENT, constant, lattice_scale, lattice_slope, viscous_scale, wall_table
 from sim.sph.neighbours import FEWEST, SKIN, Neighbours
 from sim.sph.wcsph import WCSPH
 from sim.taichi_runtime import compiling, start_taichi, ti
@@ -371,6 +371,8 @@ class SPHSimulator:
             row[k.ITERATIONS], row[k.XSPH] = solver.iterations, solver.xsph
         else:
             row[k.SOUND] = water.sound_speed * np.sqrt(self.settings["stiffness"]) / support
+            # Its density is not a sum: only gradients use the kernel.
+            row[k.KERNEL] *= lattice_slope(dim, d)
             row[k.GAMMA], row[k.ALPHA], row[k.DELTA] = water.gamma, solver.artificial_viscosity, solver.density_diffusion
         numbers[2, :dim], numbers[1, 4] = (upper - lower) / support, 1.0
         numbers[3, :dim], numbers[3, 4 : 4 + dim] = cells + 2, cells / ((upper - lower) / support)
@@ -502,7 +504,10 @@ class SPHSimulator:
         data = np.concatenate([inside, particles.velocity / support], 1).astype(np.float32)
         numbers = self._numbers(scene)
         numbers[0, _Kernels.COUNT] = n
-        table = wall_table(dim, spacing / support).astype(np.float32)
+        table = wall_table(dim, spacing / support)
+        if scene.solver.method == "wcsph":
+            table[:, [SLOPE, NORMAL, TANGENT, SPREAD]] *= lattice_slope(dim, spacing / support)
+        table = table.astype(np.float32)
         with compiling(dim):
             self._kernels.load(data, numbers.astype(np.float32), table)
             if structure.obstacles:

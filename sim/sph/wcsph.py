@@ -128,7 +128,8 @@ class WCSPH:
                     T = base.look(s)
                     weight = fluid / (1.0 - T[SHARE])
                     un, gn = u[0] * n[0] + u[1] * n[1] + u[2] * n[2], g[0] * n[0] + g[1] * n[1] + g[2] * n[2]
-                    A -= (weight * (2.0 * P * T[SLOPE] + gn * T[NORMAL])) * n
+                    # Of the whole half-space: in a corner, what is beside the other wall has been scaled up to fill it.
+                    A -= (2.0 * P * T[SLOPE] + gn * T[NORMAL]) * n
                     A[3] += weight * T[SLOPE] * un
                     if ti.static(self.structure.shifting):
                         C = T[SLOPE] * n
