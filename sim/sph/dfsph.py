@@ -352,7 +352,7 @@ class DFSPH:
         return 2.0 * way / ti.max(speed + ti.sqrt(speed * speed + 4.0 * pull * way), 1e-12), fast
 
     @ti.func
-    def step(self, n, dt, g, fast, report: ti.template()):
+    def step(self, n, dt, g, report: ti.template()):
         base = self.base
         base.list_pairs(n, report)
         self.gather(n)

@@ -218,16 +218,22 @@ class _Kernels:
                 g[d] = ti.cast(report[self.GRAVITY + d], ti.f32)
             span, cap = ti.cast(report[self.SPAN], ti.f32), ti.cast(report[self.CAP], ti.f32)
             left, taken = span, 0
+            # A new state knows no accelerations yet: a step of no length finds them.
+            fresh = self.neighbours.count[None] == 0 and ti.static(self.structure.method == "wcsph")
             while left > 1e-6 * span and taken < steps and self.neighbours.count[None] < self.neighbours.other.shape[0]:
                 limit, fast = self.scheme.limit(n, g)
                 dt = ti.min(limit, cap)
                 # Steps divide what is left of the frame.
                 dt = left / ti.max(ti.ceil(left / dt - 1e-4), 1.0)
-                self.scheme.step(n, dt, g, fast, report)
-                left -= dt
-                taken += 1
-                report[self.STEP] = ti.min(report[self.STEP], ti.cast(dt, ti.f64))
-                report[self.SPEED] = ti.max(report[self.SPEED], ti.cast(fast, ti.f64))
+                if fresh:
+                    dt = 0.0
+                self.scheme.step(n, dt, g, report)
+                if not fresh:
+                    left -= dt
+                    taken += 1
+                    report[self.STEP] = ti.min(report[self.STEP], ti.cast(dt, ti.f64))
+                    report[self.SPEED] = ti.max(report[self.SPEED], ti.cast(fast, ti.f64))
+                fresh = False
             report[self.STEPS] = ti.cast(taken, ti.f64)
             report[self.BROKEN] += ti.cast(left > 1e-6 * span, ti.f64)
             report[self.FULL] = ti.cast(self.neighbours.count[None] >= self.neighbours.other.shape[0], ti.f64)
@@ -601,6 +607,7 @@ class SPHSimulator:
         values = kernels.v.to_numpy()
         values[:n, :dim] = (velocity / self._support)[kernels.id.to_numpy()[:n]]
         kernels.v.from_numpy(values)
+        kernels.neighbours.count[None] = 0
 
     # -- the Simulator contract
     def begin(self, start: Start) -> None:
