@@ -598,7 +598,8 @@ class SPHSimulator:
         else:
             found["density"] = kernels.scheme.wall.to_numpy()[:n, 3][order].astype(float)
             k = kernels.scheme.pressure.to_numpy()[:n][order].astype(float)
-            found["pressure"] = k[:, 1] * water.density * h**2
+            # A kernel of few neighbours finds less than all of a gradient.
+            found["pressure"] = k[:, 1] / lattice_slope(dim, self._layout(self._scene)[0] / h) * water.density * h**2
         return found
 
     def set_velocity(self, velocity: np.ndarray) -> None:
