@@ -28,6 +28,8 @@ LEAST = 2
 RELAXATION = 0.5
 #: Particles with fewer neighbours than this are not held free of divergence: spray would stick together (as in SPlisHSPlasH).
 FEW = {2: 7, 3: 20}
+#: Excess of density that is rounding: pushed away in every step, it would drive a block in free flight apart.
+ROUNDING = 2e-6
 #: Residual, relative to the right side, at which the viscous solve ends.
 VISCOUS_ERROR = 1e-5
 
@@ -224,7 +226,7 @@ class DFSPH:
             # Density after the step, above rest.
             s = dt * self.push[i][3]
             if which == 1:
-                s += self.wall[i][3] - 1.0
+                s += self.wall[i][3] - (1.0 + ROUNDING)
             elif ti.static(not self.structure.full) and self.members[i] < ti.static(FEW[self.dim]):
                 s = -1.0
             self.source[i] = s
@@ -352,7 +354,7 @@ class DFSPH:
         return 2.0 * way / ti.max(speed + ti.sqrt(speed * speed + 4.0 * pull * way), 1e-12), fast
 
     @ti.func
-    def step(self, n, dt, g, fast, report: ti.template()):
+    def step(self, n, dt, g, report: ti.template()):
         base = self.base
         base.list_pairs(n, report)
         self.gather(n)

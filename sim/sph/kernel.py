@@ -48,6 +48,13 @@ def lattice_scale(dim: int, spacing: float) -> float:
     return float(1 / (spacing**dim * kernel(dim, _lattice(dim, spacing)).sum()))
 
 
+def lattice_slope(dim: int, spacing: float) -> float:
+    """What ``slope`` is multiplied by beyond ``lattice_scale``, so that on a cubic lattice the gradient of a linear function is exact: sum_j V q x^2
+    is 1 then. Without, a kernel of two spacings finds 94 % of a gradient, and water at rest needs 106 % of its pressure."""
+    r = _lattice(dim, spacing)
+    return float(dim / (spacing**dim * lattice_scale(dim, spacing) * slope(dim, r) * r**2).sum())
+
+
 #: Columns of ``wall_table``.
 SHARE, SLOPE, NORMAL, TANGENT, DRAG, SPREAD = range(6)
 

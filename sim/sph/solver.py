@@ -18,7 +18,7 @@ from sim.obstacles import combine
 from sim.scene import Incompressible, Scene
 from sim.simulator import Kind, SimulationError, Start
 from sim.sph.dfsph import DFSPH
-from sim.sph.kernel import DRAG, ENTRIES, SHARE, SLOPE, constant, lattice_scale, viscous_scale, wall_table
+from sim.sph.kernel import DRAG, ENTRIES, NORMAL, SHARE, SLOPE, SPREAD, TANGENT, constant, lattice_scale, lattice_slope, viscous_scale, wall_table
 from sim.sph.neighbours import FEWEST, SKIN, Neighbours
 from sim.sph.wcsph import WCSPH
 from sim.taichi_runtime import compiling, start_taichi, ti
@@ -218,16 +218,22 @@ class _Kernels:
                 g[d] = ti.cast(report[self.GRAVITY + d], ti.f32)
             span, cap = ti.cast(report[self.SPAN], ti.f32), ti.cast(report[self.CAP], ti.f32)
             left, taken = span, 0
+            # A new state knows no accelerations yet: a step of no length finds them.
+            fresh = self.neighbours.count[None] == 0 and ti.static(self.structure.method == "wcsph")
             while left > 1e-6 * span and taken < steps and self.neighbours.count[None] < self.neighbours.other.shape[0]:
                 limit, fast = self.scheme.limit(n, g)
                 dt = ti.min(limit, cap)
                 # Steps divide what is left of the frame.
                 dt = left / ti.max(ti.ceil(left / dt - 1e-4), 1.0)
-                self.scheme.step(n, dt, g, fast, report)
-                left -= dt
-                taken += 1
-                report[self.STEP] = ti.min(report[self.STEP], ti.cast(dt, ti.f64))
-                report[self.SPEED] = ti.max(report[self.SPEED], ti.cast(fast, ti.f64))
+                if fresh:
+                    dt = 0.0
+                self.scheme.step(n, dt, g, report)
+                if not fresh:
+                    left -= dt
+                    taken += 1
+                    report[self.STEP] = ti.min(report[self.STEP], ti.cast(dt, ti.f64))
+                    report[self.SPEED] = ti.max(report[self.SPEED], ti.cast(fast, ti.f64))
+                fresh = False
             report[self.STEPS] = ti.cast(taken, ti.f64)
             report[self.BROKEN] += ti.cast(left > 1e-6 * span, ti.f64)
             report[self.FULL] = ti.cast(self.neighbours.count[None] >= self.neighbours.other.shape[0], ti.f64)
@@ -371,6 +377,8 @@ class SPHSimulator:
             row[k.ITERATIONS], row[k.XSPH] = solver.iterations, solver.xsph
         else:
             row[k.SOUND] = water.sound_speed * np.sqrt(self.settings["stiffness"]) / support
+            # Its density is not a sum: only gradients use the kernel.
+            row[k.KERNEL] *= lattice_slope(dim, d)
             row[k.GAMMA], row[k.ALPHA], row[k.DELTA] = water.gamma, solver.artificial_viscosity, solver.density_diffusion
         numbers[2, :dim], numbers[1, 4] = (upper - lower) / support, 1.0
         numbers[3, :dim], numbers[3, 4 : 4 + dim] = cells + 2, cells / ((upper - lower) / support)
@@ -502,7 +510,10 @@ class SPHSimulator:
         data = np.concatenate([inside, particles.velocity / support], 1).astype(np.float32)
         numbers = self._numbers(scene)
         numbers[0, _Kernels.COUNT] = n
-        table = wall_table(dim, spacing / support).astype(np.float32)
+        table = wall_table(dim, spacing / support)
+        if scene.solver.method == "wcsph":
+            table[:, [SLOPE, NORMAL, TANGENT, SPREAD]] *= lattice_slope(dim, spacing / support)
+        table = table.astype(np.float32)
         with compiling(dim):
             self._kernels.load(data, numbers.astype(np.float32), table)
             if structure.obstacles:
@@ -587,7 +598,8 @@ class SPHSimulator:
         else:
             found["density"] = kernels.scheme.wall.to_numpy()[:n, 3][order].astype(float)
             k = kernels.scheme.pressure.to_numpy()[:n][order].astype(float)
-            found["pressure"] = k[:, 1] * water.density * h**2
+            # A kernel of few neighbours finds less than all of a gradient.
+            found["pressure"] = k[:, 1] / lattice_slope(dim, self._layout(self._scene)[0] / h) * water.density * h**2
         return found
 
     def set_velocity(self, velocity: np.ndarray) -> None:
@@ -596,6 +608,7 @@ class SPHSimulator:
         values = kernels.v.to_numpy()
         values[:n, :dim] = (velocity / self._support)[kernels.id.to_numpy()[:n]]
         kernels.v.from_numpy(values)
+        kernels.neighbours.count[None] = 0
 
     # -- the Simulator contract
     def begin(self, start: Start) -> None:

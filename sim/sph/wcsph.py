@@ -12,7 +12,8 @@ less than its pressure and sinks.
 At a free surface and in spray there is no tension: the density of particles that are not inside does not fall below that at rest. Two
 lone particles whose pressure was negative pulled each other to pieces.
 
-Shifting moves particles down the gradient of their concentration, by 2 max|u| dt grad C (Sun et al. 2017, eq. 10), where they are inside.
+Shifting moves particles down the gradient of their concentration, by 2 max|u| dt grad C (Sun et al. 2017, eq. 10; u: beyond the mean, so that free
+flight is one), where they are inside.
 
 Time: velocity Verlet with predicted velocity and density (Springel 2005, section 4.2), one sweep over the pairs a step.
 """
@@ -108,11 +109,19 @@ class WCSPH:
         x, u = base.x[i], base.v[i]
         P = ti.max(x[3], 0.0)
         A = self.rate[i]
-        fluid = 1.0
+        fluid, beside = 1.0, 1.0
+        solid, m = 0.0, ti.Vector.zero(ti.f32, 4)  # of the obstacles
+        if ti.static(self.structure.obstacles):
+            s, m = base.face(x, ti.static(base.faces - 1))
+            if s < 1.0:
+                solid = base.look(s)[SHARE]
         for f in ti.static(range(base.faces)):
             s, n = base.face(x, f)
             if s < 1.0:
-                fluid *= 1.0 - base.look(s)[SHARE]
+                share = base.look(s)[SHARE]
+                fluid *= 1.0 - share
+                if ti.static(f < 2 * self.dim):
+                    beside *= 1.0 - share * n.dot(m) ** 2
         if fluid < 1.0:
             for f in ti.static(range(base.faces)):
                 s, n = base.face(x, f)
@@ -128,11 +137,16 @@ class WCSPH:
                     T = base.look(s)
                     weight = fluid / (1.0 - T[SHARE])
                     un, gn = u[0] * n[0] + u[1] * n[1] + u[2] * n[2], g[0] * n[0] + g[1] * n[1] + g[2] * n[2]
-                    A -= (weight * (2.0 * P * T[SLOPE] + gn * T[NORMAL])) * n
-                    A[3] += weight * T[SLOPE] * un
+                    # Of the whole half-space, though other walls cut it: what is along those has been scaled up to go on behind them. Only of
+                    # walls one behind the other the half-spaces overlap. No pressure there is below zero.
+                    whole = beside if ti.static(f == 2 * self.dim) else 1.0 - solid * n.dot(m) ** 2
+                    A += whole * ti.max(-2.0 * P * T[SLOPE] - gn * T[NORMAL], -P * T[SLOPE]) * n
+                    # Water that leaves a wall leaves nothing behind that could hold it.
+                    A[3] += weight * T[SLOPE] * ti.select(u[3] > 1.0, un, ti.min(un, 0.0))
                     if ti.static(self.structure.shifting):
                         C = T[SLOPE] * n
-                        C[3] = T[SPREAD]
+                        # A wall that presses on nothing does not make a particle an inner one: it would be shifted into the gap.
+                        C[3] = ti.select(u[3] > 1.0, T[SPREAD], 0.0)
                         self.crowd[i] += weight * C
         if ti.static(self.structure.no_slip):
             A -= self.rub[i] + base.number[base.VISCOSITY] * (base.drag(x, u, False) - base.drag(x, u, True))
@@ -155,15 +169,26 @@ class WCSPH:
         return ti.min(dt, 0.125 * 0.25 / ti.max(base.number[base.VISCOSITY], 1e-12)), fast
 
     @ti.func
-    def step(self, n, dt, g, fast, report: ti.template()):
-        """One step; ``rate`` is that of its start."""
+    def step(self, n, dt, g, report: ti.template()):
+        """One step; ``rate`` is that of its start, which a step of no length finds."""
         base = self.base
+        shift = 0.0
+        if ti.static(self.structure.shifting):
+            mean = ti.Vector.zero(ti.f64, 4)
+            for i in range(n):
+                mean += ti.cast(base.v[i], ti.f64)
+            drift = ti.cast(mean / n, ti.f32)
+            for i in range(n):
+                u = base.v[i] - drift
+                u[3] = 0.0
+                shift = ti.max(shift, u.norm_sqr())
+            shift = 2.0 * dt * ti.sqrt(shift)
         for i in range(n):
             a = self.rate[i]
             self.before[i] = a
             move = dt * base.v[i] + (0.5 * dt * dt) * a
             if ti.static(self.structure.shifting):
-                move -= ti.select(self.crowd[i][3] > ti.static(INSIDE * self.dim), 2.0 * fast * dt, 0.0) * self.crowd[i]
+                move -= ti.select(self.crowd[i][3] > ti.static(INSIDE * self.dim), shift, 0.0) * self.crowd[i]
             move[3] = 0.0
             base.x[i] += move
             base.v[i] += dt * a

@@ -1,8 +1,9 @@
 """Cases with a known answer, one small file each, run at a chosen resolution.
 
 A case is a module of ``CASES`` with ``NUMBER`` (in the ladder), ``RESOLUTIONS`` (three, coarse to fine; the comment above says of what) and
-``run(resolution) -> Outcome``. It starts the solver, compares and times it; it judges nothing but hands over the tolerance beside the
-error. ``python -m sim.validation`` runs all and writes docs/validation.md.
+``run(resolution) -> Outcome``; one for other solvers than MPM names them in ``METHODS`` and has ``run(resolution, method)``. It starts the
+solver, compares and times it; it judges nothing but hands over the tolerance beside the error. ``python -m sim.validation`` runs all and
+writes docs/validation.md.
 """
 
 import time

@@ -2,20 +2,23 @@
 
 import numpy as np
 
-from sim.mpm.solver import MPMSimulator
+from sim.solvers import solver_class
 from sim.validation import Curve, Outcome, period, scene, timed
 
 NUMBER = 10
+METHODS = ("mpm", "wcsph", "dfsph")
 #: Cells along the tank; it is half as deep.
 RESOLUTIONS = (16, 32, 64)
 LENGTH, DEPTH, C, G = 1.0, 0.5, 30.0, 9.8
-PERIODS, FRAMES_A_PERIOD = 3, 60
+PERIODS, FRAMES_A_PERIOD = 2, 60
 
 
-def run(resolution: int) -> Outcome:
+def run(resolution: int, method: str) -> Outcome:
     """Half a wave along the tank, set going by the velocities of the linear mode, phi ~ cosh(k y) cos(k x); 1 % of the depth high.
 
-    The particles' velocities are projected onto the mode where they started.
+    The particles' velocities are projected onto the mode where they started. SPH: a support of three spacings. The wave is lower than a spacing and
+    particles keep their lattice, which resists being sheared under pressure the more, the fewer neighbours bear it: with 2.5 spacings WCSPH
+    is 6 % fast and has lost half of the amplitude after two periods, with 3 it is 1 % fast and has lost a tenth.
     """
     k = np.pi / LENGTH
     omega = np.sqrt(G * k * np.tanh(k * DEPTH))
@@ -23,8 +26,9 @@ def run(resolution: int) -> Outcome:
     what = scene(
         "standing-wave", {"model": "water", "sound_speed": C}, [{"kind": "box", "lower": [0.0, 0.0], "upper": [LENGTH, DEPTH]}],
         [[0.0, LENGTH], [0.0, 1.0]], [resolution, round(resolution / LENGTH)], exact / FRAMES_A_PERIOD, gravity=[0.0, -G],
+        solver={"method": method} | ({} if method == "mpm" else {"support": 3.0}),
     )  # fmt: skip
-    solver = MPMSimulator()
+    solver = solver_class(method)()
     solver.load(what)
     x, y = what.particles().position.T
     mode = np.stack([-np.sin(k * x) * np.cosh(k * y), np.cos(k * x) * np.sinh(k * y)], 1)

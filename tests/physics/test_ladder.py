@@ -8,20 +8,21 @@ from scipy.spatial import cKDTree
 
 from sim.validation import CASES, Curve, Outcome
 from sim.validation.granular_collapse import packed
-from sim.validation.ladder import main, module, order, page
+from sim.validation.ladder import main, methods, module, order, page, run
 
-#: Cases that hold, each at the least resolution that is worth its time. Those that do not hold yet are in docs/validation.md.
+#: Cases that hold and their methods, each at the least resolution that is worth its time. Those that do not hold yet are in docs/validation.md.
 AFFORDABLE = {
-    "rotation": 32, "return_map": 1000, "hydrostatics": 32, "elastic_column": 16, "axial_bar": 4, "cantilever": 4, "standing_wave": 32,
-    "dam_break": 16, "granular_collapse": 8, "block_on_plane": 32, "elastic_discs": 40, "viscoplastic_slump": 80,
-}
+    ("rotation", "mpm"): 32, ("return_map", "mpm"): 1000, ("hydrostatics", "mpm"): 32, ("elastic_column", "mpm"): 16, ("axial_bar", "mpm"): 4,
+    ("cantilever", "mpm"): 4, ("standing_wave", "mpm"): 32, ("dam_break", "mpm"): 16, ("granular_collapse", "mpm"): 8,
+    ("block_on_plane", "mpm"): 32, ("elastic_discs", "mpm"): 40, ("viscoplastic_slump", "mpm"): 80,
+}  # fmt: skip
 
 
 @pytest.mark.physics
-@pytest.mark.parametrize("case", AFFORDABLE)
-def test_case(case):
-    outcome = module(case).run(AFFORDABLE[case])
-    assert outcome.case == case and outcome.resolution == AFFORDABLE[case] and outcome.seconds > 0 and outcome.particles > 0
+@pytest.mark.parametrize(("case", "method"), AFFORDABLE)
+def test_case(case, method):
+    outcome = run(case, AFFORDABLE[case, method], method)
+    assert outcome.case == case and outcome.resolution == AFFORDABLE[case, method] and outcome.seconds > 0 and outcome.particles > 0
     for name, curve in outcome.curves.items():
         assert len(curve.x) == len(curve.ours) == len(curve.reference), name
         assert np.isfinite(curve.ours).all(), name
@@ -62,15 +63,16 @@ def test_order_of_convergence():
 
 def test_the_page_says_what_failed(tmp_path):
     found = {
-        "hydrostatics": outcomes("hydrostatics", 1, 1, 0.09), "dam_break": outcomes("dam_break", 0, 0, -0.11),
-        "rotation": [*outcomes("rotation", 0, 0, 0)[:2], "time step fell below 1e-9 s"],
+        "hydrostatics": {"mpm": outcomes("hydrostatics", 1, 1, 0.09)},
+        "dam_break": {"mpm": outcomes("dam_break", 0, 0, -0.11), "wcsph": outcomes("dam_break", 0, 0, 0)},
+        "rotation": {"mpm": [*outcomes("rotation", 0, 0, 0)[:2], "time step fell below 1e-9 s"]},
     }
     text, holds = page(found, tmp_path, "versions")
-    assert not holds and "1 of 3 cases hold. Missed: Dam break, Rotation and free fall." in text
-    assert "failed: time step fell below" in text and "label -0.11" in text
+    assert not holds and "2 of 4 hold. Missed: Dam break (mpm), Rotation and free fall (mpm)." in text
+    assert "failed: time step fell below" in text and "label -0.11" in text and "| wcsph | thing |" in text
     assert sorted(path.stem for path in (tmp_path / "validation").iterdir()) == sorted(found)
     text, holds = page({"hydrostatics": found["hydrostatics"]}, tmp_path, "versions")
-    assert holds and "All 1 cases hold." in text
+    assert holds and "All 1 hold." in text
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -78,6 +80,7 @@ def test_every_case_is_complete(case):
     found = module(case)
     assert isinstance(found.NUMBER, int) and len(found.RESOLUTIONS) == 3 and list(found.RESOLUTIONS) == sorted(found.RESOLUTIONS)
     assert ":" in found.__doc__.splitlines()[0], "a title, a colon, what is compared"
+    assert methods(case) and set(methods(case)) <= {"mpm", "wcsph", "dfsph"}
 
 
 def test_an_unknown_case_is_refused(capsys):

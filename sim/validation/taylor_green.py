@@ -1,0 +1,35 @@
+"""Taylor-Green vortices: in a periodic box their kinetic energy decays as exp(-16 pi^2 t / Re)."""
+
+import numpy as np
+
+from sim.solvers import solver_class
+from sim.validation import Curve, Outcome, scene, timed
+
+NUMBER = 7
+METHODS = ("wcsph", "dfsph")
+#: Particles along the box.
+RESOLUTIONS = (30, 50, 100)
+RE, C, END, FRAMES = 100, 10.0, 1.0, 50
+
+
+def run(resolution: int, method: str) -> Outcome:
+    """A box and a speed of 1, c = 10: u = -cos(2 pi x) sin(2 pi y), v = sin(2 pi x) cos(2 pi y), from a plain lattice. Viscosity decides the decay, so there is no
+    artificial one. The rate is that of a line through the logarithm of the energy, until it is down to a fifth."""
+    settings = {"artificial_viscosity": 0.0} if method == "wcsph" else {}
+    what = scene(
+        "taylor-green", {"model": "water", "sound_speed": C, "density": 1.0, "viscosity": 1 / RE},
+        [{"kind": "box", "lower": [0.0, 0.0], "upper": [1.0, 1.0]}], [[0.0, 1.0]] * 2, [resolution // 2] * 2, END / FRAMES,
+        periodic=["x", "y"], solver={"method": method} | settings,
+    )  # fmt: skip
+    solver = solver_class(method)()
+    solver.load(what)
+    x, y = 2 * np.pi * what.particles().position.T
+    velocity = np.stack([-np.cos(x) * np.sin(y), np.sin(x) * np.cos(y)], 1)
+    solver.set_velocity(velocity)
+    energy, seconds = timed(solver.frame, FRAMES, lambda _: solver.diagnostics()["kinetic_energy"])
+    ours, t = np.array(energy) / ((velocity**2).sum() / 2 * what.spacing**2), what.frame_step * np.arange(1, FRAMES + 1)
+    rate = -16 * np.pi**2 / RE
+    found = float(np.polyfit(t, np.log(ours), 1)[0])
+    curve = Curve(f"rate of decay {found:.3f}, exact {rate:.3f}", ("time", "kinetic energy / that of the start"), t, np.exp(rate * t), ours,
+                  found / rate - 1, 0.05)  # fmt: skip
+    return Outcome("taylor_green", resolution, len(x), {"decay": curve}, seconds)

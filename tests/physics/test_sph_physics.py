@@ -1,0 +1,80 @@
+"""What SPH must get right beside the ladder."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sim.sph.kernel import lattice_scale, lattice_slope, slope
+from sim.sph.solver import SPHSimulator
+from sim.validation import scene
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("support", [1.5, 2.0, 2.5, 3.7])
+def test_the_gradient_of_a_linear_function_is_exact_on_a_lattice(dim, support):
+    d = 1 / support
+    x = np.stack(np.meshgrid(*[np.arange(-4, 5) * d] * dim, indexing="ij"), -1).reshape(-1, dim)
+    q = lattice_slope(dim, d) * lattice_scale(dim, d) * slope(dim, np.linalg.norm(x, axis=1)) * d**dim
+    # a x_0, of each: sum_j V (f_j - f_i) grad W is minus this, r being x_i - x_j.
+    np.testing.assert_allclose((q[:, None] * x[:, :1] * x).sum(0), [1.0] + [0.0] * (dim - 1), atol=1e-12)
+
+
+@pytest.mark.physics
+def test_pressure_in_a_corner():
+    """All of the column of particles beside a vertical wall, the one in the corner among them, is under the pressure of its depth."""
+    H, G, C = 0.5, 9.8, 20.0
+    what = scene("corner", {"model": "water", "sound_speed": C}, [{"kind": "box", "lower": [0.0, 0.0], "upper": [1.0, H]}], [[0.0, 1.0]] * 2,
+                 [16] * 2, 4 * H / C / 10, gravity=[0.0, -G], solver={"method": "wcsph", "support": 2.0})  # fmt: skip
+    solver = SPHSimulator()
+    solver.load(what)
+    edge = what.particles().position[:, 0] < what.spacing
+    found = []
+    for frame in range(200):
+        solver.frame()
+        if frame >= 100:
+            state = solver.state()
+            found.append((state["pressure"][edge] / (1000 * G * H), 1 - state["position"][edge, 1] / H))
+    ours, exact = np.mean(found, 0)
+    assert edge.sum() == 16
+    np.testing.assert_allclose(ours, exact, atol=0.02)
+
+
+@pytest.mark.physics
+@pytest.mark.parametrize("method", ["wcsph", "dfsph"])
+def test_nothing_hangs_from_a_ceiling(method):
+    """A block that starts at the ceiling falls freely: no wall pulls."""
+    g, t = 9.8, 0.1
+    what = scene("ceiling", {"model": "water", "sound_speed": 20.0}, [{"kind": "box", "lower": [0.3, 0.75], "upper": [0.7, 1.0]}], [[0.0, 1.0]] * 2,
+                 [16] * 2, t / 10, gravity=[0.0, -g], solver={"method": method})  # fmt: skip
+    solver = SPHSimulator()
+    solver.load(what)
+    for _ in range(10):
+        position = solver.frame()
+    fallen = what.particles().position[:, 1] - position[:, 1]
+    # Symplectic Euler is g dt t / 2 ahead.
+    ahead = g * solver.diagnostics()["dt"] * t / 2 if method == "dfsph" else 0.0
+    assert fallen.mean() == pytest.approx(g * t**2 / 2 + ahead, rel=0.01)
+
+
+@pytest.mark.physics
+@pytest.mark.parametrize("method", ["wcsph", "dfsph"])
+def test_a_throw_is_a_parabola_from_its_first_step(method):
+    """Also with shifting: what moves as one has nothing to be shifted by. Velocities are set after the scene was loaded. Without density diffusion,
+    which takes pressures to be hydrostatic and moves a surface in flight by a fortieth of a spacing."""
+    g, t = 9.8, 0.1
+    what = scene("throw", {"model": "water", "sound_speed": 20.0}, [{"kind": "ball", "center": [0.4, 0.4], "radius": 0.15}], [[0.0, 1.0]] * 2,
+                 [16] * 2, t / 10, gravity=[0.0, -g],
+                 solver={"method": method} | ({"density_diffusion": 0.0} if method == "wcsph" else {}))  # fmt: skip
+    solver = SPHSimulator()
+    solver.load(what)
+    start = what.particles().position
+    solver.set_velocity(np.tile([1.0, 2.0], (len(start), 1)))
+    for _ in range(10):
+        solver.frame()
+    state = solver.state()
+    np.testing.assert_allclose(state["velocity"].mean(0), [1.0, 2.0 - g * t], atol=1e-5)
+    moved = state["position"] - start
+    ahead = -g * solver.diagnostics()["dt"] * t / 2 if method == "dfsph" else 0.0
+    np.testing.assert_allclose(moved.mean(0), [t, 2 * t - g * t**2 / 2 + ahead], atol=1e-5)
+    assert np.ptp(moved, axis=0).max() < 0.01 * what.spacing
