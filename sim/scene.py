@@ -225,7 +225,7 @@ class PositionBased(_Strict):
     support: _Support = 2.0
     substeps: Annotated[int, Field(ge=1, le=1000)] = 2
     density_error: Annotated[float, Field(gt=0, le=0.1)] = 1e-3
-    iterations: Annotated[int, Field(ge=1, le=10_000)] = 200
+    iterations: Annotated[int, Field(ge=1, le=10_000)] = 1000
     xsph: Annotated[float, Field(ge=0, lt=1)] = 0.01
     tensile: Annotated[float, Field(ge=0, le=1)] = 0.0
 

@@ -66,21 +66,18 @@ class Bodies:
         self.span = ti.Vector.field(2, ti.i32, capacity)  # of the scene's particles
         self.rest = ti.Vector.field(3, ti.f64, particles)
         self.corner = ti.field(ti.i32, particles)
-        self.push = ti.Vector.field(2 * self.dim, ti.f64, particles)
+        self.push = ti.Vector.field(6, ti.f64, particles)
         self.centre, self.velocity, self.momentum = (ti.Vector.field(3, ti.f64, capacity) for _ in range(3))
         self.turn = ti.Vector.field(4, ti.f64, capacity)
         self.inertia, self.inverse = (ti.Matrix.field(3, 3, ti.f64, capacity) for _ in range(2))  # in the body
         self.ahead, self.ahead_turn = ti.Vector.field(3, ti.f64, capacity), ti.Vector.field(4, ti.f64, capacity)
-        self.state = [self.centre, self.velocity, self.momentum, self.turn]
-        self.saved = [ti.Vector.field(field.n, ti.f64, capacity) for field in self.state]
 
     @staticmethod
     def sizes(dim: int, capacity: int, particles: int) -> dict[str, tuple[int, int]]:
         """Fields as ``plan`` lists them: name -> (bytes an entry, entries)."""
-        state = {"centre": 24, "velocity": 24, "momentum": 24, "turn": 32}
-        fields = {"span": 8, **state, **{f"saved {name}": size for name, size in state.items()}, "inertia": 72, "inverse inertia": 72,
-                  "centre ahead": 24, "turn ahead": 32}  # fmt: skip
-        own = {"rest place": 24, "corner": 4, "push": 16 * dim}
+        fields = {"span": 8, "centre": 24, "velocity": 24, "momentum": 24, "turn": 32, "inertia": 72, "inverse inertia": 72, "centre ahead": 24,
+                  "turn ahead": 32}  # fmt: skip
+        own = {"rest place": 24, "corner": 4, "push": 48}
         return {f"rigid {name}": (size, capacity) for name, size in fields.items()} | {f"rigid {name}": (size, particles) for name, size in own.items()}
 
     @ti.func

@@ -12,10 +12,10 @@ what the displacements add, over dt, and share a little of their neighbours' mea
 
 Decisions, after PositionBasedDynamics (Bender), FleX (Macklin et al. 2014) and our DFSPH:
 - The multipliers k are *summed up* and never negative, as in XPBD (Macklin et al. 2016) and contact solvers, where the paper starts each iteration from
-  none: what one iteration pushed too far the next takes back, so iterations converge to incompressible water, and k starts from
-  the step before. A fixed number of them (FleX: 4) leaves a spring whose stiffness is the number; these end when the mean residual
-  (|C| under pressure, else C where positive) is below ``density_error``. A solve that does not get there repeats its frame with half the step, and
-  after ``MAX_HALVINGS`` ends the trajectory.
+  none: what one iteration pushed too far the next takes back, so iterations converge to incompressible water. A fixed number of them (FleX: 4) leaves a spring whose stiffness is the number; these end when the mean residual
+  (|C| under pressure, else C where positive) is below ``density_error``. A solve that does not get there ends the trajectory; shorter steps would
+  be no remedy, for what is left of C becomes a velocity C spacing / dt.
+- k starts from ``WARM`` times that of the step before: from all of it pressures, a step late, fed a bouncing of whole columns.
 - Inequality: a bilateral C pulls what is at the surface together, into clumps that the paper's s_corr = -k (W / W(dq))^4 must part again.
 - Particles of a body are fluid that is frozen: same V, own k, pairs of one body apart. So the body displaces its volume, pressure passes through its
   faces as through water, and bodies meet each other by the same constraint. FleX has contacts there, and a ``buoyancy`` to be tuned.
@@ -44,8 +44,9 @@ from sim.taichi_runtime import compiling, start_taichi, ti
 RELAXATION = 0.5
 #: Least D_i: of particles on top of each other gradients vanish, and a displacement by 1 / gradient would throw them about (eq. 11 has a constant too).
 LEAST_D = 0.05
-#: Halvings of the planned step before a trajectory is given up.
-MAX_HALVINGS = 6
+#: Share of the multipliers of the step before that a solve starts from (as Bender & Koschier 2017). 0: 1.7 times the iterations; 0.8: three times the
+#: kinetic energy of a column at rest; 1: two hundred times.
+WARM = 0.5
 #: Steps of a frame at most.
 MOST_STEPS = 10_000
 #: Distance from a wall, in support radii, at which particles are stopped.
@@ -66,8 +67,7 @@ class Structure:
 
 def _capacity(particles: int) -> int:
     """Particles that fields are made for: few different numbers, for each compiles anew."""
-    step = 1 << max(int(particles).bit_length() - 3, 6)
-    return -(-particles // step) * step
+    return 1 << max(int(particles) - 1, 63).bit_length()
 
 
 @ti.data_oriented
@@ -88,10 +88,9 @@ class _Kernels:
         self.x, self.v = (ti.Vector.field(4, ti.f32, capacity) for _ in range(2))  # v[3]: w
         self.ahead = ti.Vector.field(4, ti.f32, capacity)  # where it would fly; lane 3: k
         self.id, self.body = (ti.field(ti.i32, capacity) for _ in range(2))  # body -1: water
-        self.moved, self.saved = ([ti.Vector.field(4, ti.f32, capacity) for _ in range(3)] for _ in range(2))
-        self.moved_id, self.saved_id, self.moved_body, self.saved_body = (ti.field(ti.i32, capacity) for _ in range(4))
         self.state, self.labels = [self.x, self.v, self.ahead], [self.id, self.body]
-        self.moved_labels, self.saved_labels = [self.moved_id, self.moved_body], [self.saved_id, self.saved_body]
+        self.moved = [ti.Vector.field(4, ti.f32, capacity) for _ in range(3)]
+        self.moved_labels = [ti.field(ti.i32, capacity) for _ in range(2)]
         self.gradient = ti.Vector.field(4, ti.f32, pairs)  # G_ij; lane 3: V W
         self.sums = ti.Vector.field(4, ti.f32, capacity)  # sum_j G_ij; lane 3: sum_j w_j |G_ij|^2, then dk
         self.wall = ti.Vector.field(4, ti.f32, capacity)  # the walls' part of G_i; lane 3: density
@@ -298,7 +297,7 @@ class _Kernels:
                 move = dt * self.v[i]
                 move[3] = 0.0
                 self.x[i] += move
-            k = ratio * ratio * self.ahead[i][3]
+            k = WARM * ratio * ratio * self.ahead[i][3]
             self.ahead[i] = self.x[i]
             # Multipliers are impulses times dt.
             self.ahead[i][3] = k
@@ -338,21 +337,11 @@ class _Kernels:
 
     # -- kernels
     @ti.kernel
-    def frame(self, keep: ti.i32, steps: ti.i32, position: ti.types.ndarray(ti.f32, 2), report: ti.types.ndarray(ti.f64, 1)):
-        """One frame of at most so many steps; ``keep`` saves the state first."""
+    def frame(self, steps: ti.i32, position: ti.types.ndarray(ti.f32, 2), report: ti.types.ndarray(ti.f64, 1)):
+        """One frame of at most so many steps."""
         ti.loop_config(serialize=True)
         for _ in range(1):
             n = ti.cast(self.number[self.COUNT], ti.i32)
-            if keep:
-                for i in range(n):
-                    for f in ti.static(range(3)):
-                        self.saved[f][i] = self.state[f][i]
-                    for f in ti.static(range(2)):
-                        self.saved_labels[f][i] = self.labels[f][i]
-                if ti.static(self.structure.bodies > 0):
-                    for b in range(self.bodies.count[None]):
-                        for f in ti.static(range(4)):
-                            self.bodies.saved[f][b] = self.bodies.state[f][b]
             g = ti.Vector.zero(ti.f32, 4)
             for d in ti.static(range(self.dim)):
                 g[d] = ti.cast(report[self.GRAVITY + d], ti.f32)
@@ -454,21 +443,6 @@ class _Kernels:
                 for b in range(self.bodies.count[None]):
                     self.bodies.take_velocity(b)
 
-    @ti.kernel
-    def restore(self, n: ti.i32):
-        ti.loop_config(serialize=True)
-        for _ in range(1):
-            for i in range(n):
-                for f in ti.static(range(3)):
-                    self.state[f][i] = self.saved[f][i]
-                for f in ti.static(range(2)):
-                    self.labels[f][i] = self.saved_labels[f][i]
-            self.forget(n)
-            if ti.static(self.structure.bodies > 0):
-                for b in range(self.bodies.count[None]):
-                    for f in ti.static(range(4)):
-                        self.bodies.state[f][b] = self.bodies.saved[f][b]
-
 
 class PBDSimulator:
     """The solver under the ``Simulator`` contract; also driven directly by ``load`` and ``frame``.
@@ -554,7 +528,7 @@ class PBDSimulator:
         particles = scene.particles(self._refine(scene))
         n, boxes, pairs = self._sizes(scene, len(particles.position))
         state = {"x": 16, "v": 16, "ahead": 16, "id": 4, "body": 4}
-        fields = {f"{kept}{name}": (size, n) for kept in ("", "moved ", "saved ") for name, size in state.items()}
+        fields = {f"{kept}{name}": (size, n) for kept in ("", "moved ") for name, size in state.items()}
         fields |= {"sums": (16, n), "wall": (16, n), "drift": (16, n), "cell": (4, n), "sorted place": (4, n), "first pair": (4, n + 1),
                    "place when listed": (16, n), "pairs": (4, pairs), "gradients": (16, pairs), "first of a cell": (4, boxes + 2),
                    "next of a cell": (4, boxes + 2), "walls": (24, ENTRIES + 2)}  # fmt: skip
@@ -574,7 +548,7 @@ class PBDSimulator:
         return {
             "title": "position-based dynamics", "dim": dim, "rates": ["pbf"], "materials": [each.model for each in scene.materials.values()],
             "walls": "slip", "obstacles": 0, "context": 0 if context is None else context.shape[1],
-            "kernels": ["load", "frame", "restore"], "fields": fields, "left_out": {what: why for what, why in reasons.items() if why},
+            "kernels": ["load", "frame"], "fields": fields, "left_out": {what: why for what, why in reasons.items() if why},
             "bytes": sum(size * count for size, count in fields.values()), "particles": len(particles.position),
             "recorded": len(particles.tracked), "kinematic": 0, "cells": cells.tolist(), "grid_spacing": support * (1 + SKIN), "wave_speed": 0.0,
             "substeps_per_frame": [max(1, int(np.ceil(scene.frame_step / step - 1e-6))) for step in steps],
@@ -613,22 +587,21 @@ class PBDSimulator:
         ratio = self._density(scene) / np.array([material.density for material in scene.materials.values()])[particles.material]
         data = np.concatenate([inside, particles.velocity / support, ratio[:, None]], 1).astype(np.float32)
         walls = wall_table(dim, spacing / support).astype(np.float32)
-        with compiling(dim):
+        # As in 3D: at the higher level that 2D is compiled at elsewhere, bodies' float64 vectors crash.
+        with compiling(3):
             self._kernels.load(data, labels, self._numbers(scene, n).astype(np.float32), walls, table.reshape(-1, COLUMNS), places)
-            self._run(0.0, 1.0, 0, keep=True)
-            if fresh:
-                self._kernels.restore(n)
+            self._run(0.0, 1.0, 0)
         if fresh:
             self.compile_seconds += time.perf_counter() - begun
 
-    def _run(self, span: float, cap: float, steps: int, keep: bool) -> np.ndarray:
+    def _run(self, span: float, cap: float, steps: int) -> np.ndarray:
         k, scene = _Kernels, self._scene
         report = np.zeros(k.REPORT)
         report[k.STEP] = report[k.SPAN] = span
         report[k.CAP], report[k.LAST] = cap, self._last
         felt = np.array(scene.gravity) - self._acceleration[min(self._frame, len(self._acceleration) - 1)]
         report[k.GRAVITY : k.GRAVITY + scene.dim] = felt / self._support
-        self._kernels.frame(int(keep), steps, self._position, report)
+        self._kernels.frame(steps, self._position, report)
         joule = self._mass * self._support**2
         self._diagnostics = {
             "kinetic_energy": report[k.KINETIC] * joule, "potential_energy": report[k.POTENTIAL] * joule,
@@ -638,23 +611,14 @@ class PBDSimulator:
         return report
 
     def frame(self) -> np.ndarray:
-        """Advance one frame; positions of the recorded particles, [n, dim] float32. Raises ``SimulationError``.
-
-        A frame whose constraints were not solved, or that is not finite, is taken back and repeated with half the step; where the step is fixed, it
-        ends the trajectory.
-        """
+        """Advance one frame; positions of the recorded particles, [n, dim] float32. Raises ``SimulationError``: the state is then of no use."""
         k, scene = _Kernels, self._scene
-        fixed = self._fixed(scene)
-        cap = fixed or scene.frame_step / scene.solver.substeps
-        for attempt in range(1 if fixed else MAX_HALVINGS + 1):
-            report = self._run(scene.frame_step, cap, MOST_STEPS, keep=attempt == 0)
-            if np.isfinite(report).all() and not (report[k.BROKEN] or report[k.UNSOLVED] or report[k.FULL]):
-                self._frame += 1
-                self._last = report[k.LAST]
-                return self._recorded()
-            self._kernels.restore(len(self._position))
-            cap = min(cap, report[k.STEP]) / 2
-        raise SimulationError(self._why(report))
+        report = self._run(scene.frame_step, self._fixed(scene) or scene.frame_step / scene.solver.substeps, MOST_STEPS)
+        if not np.isfinite(report).all() or report[k.BROKEN] or report[k.UNSOLVED] or report[k.FULL]:
+            raise SimulationError(self._why(report))
+        self._frame += 1
+        self._last = report[k.LAST]
+        return self._recorded()
 
     def _why(self, report: np.ndarray) -> str:
         k = _Kernels
@@ -667,7 +631,7 @@ class PBDSimulator:
         if report[k.UNSOLVED]:
             return (f"densities did not converge in {self._scene.solver.iterations} iterations (mean error {report[k.ERROR]:.2g}), at a step of "
                     f"{report[k.STEP]:.3g} s")  # fmt: skip
-        return f"time step fell below {report[k.STEP]:.3g} s without a finite, stable frame"
+        return f"more than {MOST_STEPS} steps in a frame: speeds run away"
 
     def _recorded(self) -> np.ndarray:
         return (self._lower + self._position[self._tracked].astype(float) * self._support).astype(np.float32)
