@@ -219,7 +219,8 @@ class PositionBased(_Strict):
 
     support [particle spacings]; substeps of a frame at least (FleX takes two); density_error: mean error, relative density, at which a solve ends;
     iterations of a solve at most; xsph: share of the neighbours' mean velocity that a particle takes on in every step (0.01 as published);
-    tensile: share by which s_corr parts pairs that are closer than the spacing; 0, for held to C <= 0 water does not clump."""
+    tensile: strength of s_corr, which parts pairs that are closer than the spacing: at 0.01 the closest of water at rest are 0.89 of it apart instead of
+    0.77, above 0.02 it does not come to rest."""
 
     method: Literal["pbf"]
     support: _Support = 2.0
@@ -227,7 +228,7 @@ class PositionBased(_Strict):
     density_error: Annotated[float, Field(gt=0, le=0.1)] = 1e-3
     iterations: Annotated[int, Field(ge=1, le=10_000)] = 1000
     xsph: Annotated[float, Field(ge=0, lt=1)] = 0.01
-    tensile: Annotated[float, Field(ge=0, le=1)] = 0.0
+    tensile: Annotated[float, Field(ge=0, le=0.02)] = 0.01
 
 
 Solver = Annotated[MaterialPoints | WeaklyCompressible | Incompressible | PositionBased, Field(discriminator="method")]

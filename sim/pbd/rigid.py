@@ -97,13 +97,12 @@ class Bodies:
 
     @ti.func
     def fly(self, b, dt, kick):
-        """c += V dt, after the kick; turned by the spin at the middle of the step; then off the walls."""
+        """c += V dt, after the kick; turned by the spin at the middle of the step."""
         self.velocity[b] += kick
         self.centre[b] += dt * self.velocity[b]
         q = self.turn[b]
         self.turn[b] = turned(q, dt * self.spin(b, turned(q, 0.5 * dt * self.spin(b, q))))
         self.ahead[b], self.ahead_turn[b] = self.centre[b], self.turn[b]
-        self.hold(b)
         self.put(b)
 
     @ti.func

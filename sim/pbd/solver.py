@@ -47,6 +47,8 @@ LEAST_D = 0.05
 #: Share of the multipliers of the step before that a solve starts from (as Bender & Koschier 2017). 0: 1.7 times the iterations; 0.8: three times the
 #: kinetic energy of a column at rest; 1: two hundred times.
 WARM = 0.5
+#: Largest W / W(spacing) that s_corr raises to the fourth power: of particles on top of each other it would be 800.
+MOST_RATIO = 2.0
 #: Steps of a frame at most.
 MOST_STEPS = 10_000
 #: Distance from a wall, in support radii, at which particles are stopped.
@@ -206,8 +208,8 @@ class _Kernels:
         return error / ti.cast(n, ti.f32)
 
     @ti.func
-    def displace(self, n):
-        """x by the multipliers' changes; bodies as a whole; all off the walls."""
+    def push(self, n):
+        """``drift`` = sum_j dk_j grad_i C_j."""
         for i in range(n):
             self.drift[i] = self.sums[i][3] * self.wall[i]
         for i in range(n):
@@ -218,23 +220,11 @@ class _Kernels:
                 total += f
                 self.drift[j] -= f
             self.drift[i] += total
-        for i in range(n):
-            for d in ti.static(range(self.dim)):
-                self.x[i][d] -= self.v[i][3] * self.drift[i][d]
-        self.settle(n)
 
     @ti.func
-    def settle(self, n):
-        for i in range(n):
-            self.enclose(i)
-        if ti.static(self.structure.bodies > 0):
-            for b in range(self.bodies.count[None]):
-                self.bodies.match(b)
-
-    @ti.func
-    def part(self, n):
-        """s_corr (eq. 13): what is closer than it would be on the lattice is pushed apart."""
-        near = self.number[self.NEAREST]
+    def part(self, n, dt):
+        """``drift`` of s_corr (eq. 13): what is closer than on the lattice is pushed apart. Once a step, as an acceleration."""
+        near, strength = self.number[self.NEAREST], dt * dt * self.number[self.TENSILE]
         for i in range(n):
             self.drift[i] = ti.Vector.zero(ti.f32, 4)
         for i in range(n):
@@ -242,16 +232,23 @@ class _Kernels:
             for k in range(self.neighbours.first[i], self.neighbours.first[i + 1]):
                 j = self.neighbours.other[k]
                 G = self.gradient[k]
-                q = G[3] / near
+                q = ti.min(G[3] / near, MOST_RATIO)
                 q *= q
-                f = (self.number[self.TENSILE] * q * q / ti.max(D, self.sums[j][3])) * G
+                f = (strength * ti.max(q * q - 1.0, 0.0) / ti.max(D, self.sums[j][3])) * G
                 total += f
                 self.drift[j] -= f
             self.drift[i] += total
+
+    @ti.func
+    def displace(self, n):
+        """x -= w drift; bodies as a whole; all off the walls."""
         for i in range(n):
             for d in ti.static(range(self.dim)):
                 self.x[i][d] -= self.v[i][3] * self.drift[i][d]
-        self.settle(n)
+            self.enclose(i)
+        if ti.static(self.structure.bodies > 0):
+            for b in range(self.bodies.count[None]):
+                self.bodies.match(b)
 
     @ti.func
     def smooth(self, n):
@@ -306,22 +303,23 @@ class _Kernels:
             for b in range(self.bodies.count[None]):
                 self.bodies.fly(b, ti.cast(dt, ti.f64), ti.cast(ti.Vector([kick[0], kick[1], kick[2]]), ti.f64))
         tolerance, most = self.number[self.ERROR_AT_MOST], ti.cast(self.number[self.ITERATIONS], ti.i32)
-        self.list_pairs(n, report)
-        self.gather(n)
-        if ti.static(self.structure.tensile):
-            self.part(n)
-            self.list_pairs(n, report)
-            self.gather(n)
-        self.multiply(n, True)
-        self.displace(n)
-        iterations, error = 0, 1e30
+        # Stages of one loop, for each copy of the functions in the code costs a second of compilation: s_corr, the multipliers of the step before, solve.
+        stage, iterations, error = ti.static(0 if self.structure.tensile else 1), 0, 1e30
         while error > tolerance and iterations <= most and self.neighbours.count[None] < self.neighbours.other.shape[0]:
             self.list_pairs(n, report)
             self.gather(n)
-            error = self.multiply(n, False)
+            if stage == 0:
+                if ti.static(self.structure.tensile):
+                    self.part(n, dt)
+            else:
+                left = self.multiply(n, stage == 1)
+                if stage == 2:
+                    error = left
+                    iterations += 1
+                self.push(n)
             if error > tolerance:
                 self.displace(n)
-                iterations += 1
+            stage = ti.min(stage + 1, 2)
         report[self.SOLVED] += ti.cast(iterations, ti.f64)
         report[self.ERROR] = ti.max(report[self.ERROR], ti.cast(error, ti.f64))
         report[self.UNSOLVED] += ti.cast(not error <= tolerance, ti.f64)
@@ -419,8 +417,6 @@ class _Kernels:
                     inertia = ti.Matrix([[bodies[b, 5 + 3 * row + column] for column in range(3)] for row in range(3)])
                     self.bodies.inertia[b], self.bodies.inverse[b] = inertia, inertia.inverse()
                     self.bodies.turn[b] = ti.Vector([1.0, 0.0, 0.0, 0.0])
-                    self.bodies.hold(b)
-                    self.bodies.put(b)
                     self.bodies.take_velocity(b)
 
     @ti.func
@@ -496,7 +492,7 @@ class PBDSimulator:
         row, scale = numbers[0], constant(dim) * lattice_scale(dim, d)
         row[k.COUNT], row[k.VOLUME], row[k.KERNEL], row[k.SPACING] = particles, d**dim, scale, d
         row[k.CFL], row[k.ERROR_AT_MOST] = self.settings["cfl"] or scene.cfl, solver.density_error * self.settings["tolerance"]
-        row[k.ITERATIONS], row[k.XSPH], row[k.TENSILE] = solver.iterations, solver.xsph, solver.tensile
+        row[k.ITERATIONS], row[k.XSPH], row[k.TENSILE] = solver.iterations, solver.xsph, solver.tensile * (solver.substeps / scene.frame_step) ** 2
         row[k.NEAREST] = d**dim * scale * (1 - d) ** 4 * (1 + 4 * d)
         numbers[2, :dim] = width
         numbers[3, :dim], numbers[3, 4 : 4 + dim] = cells + 2, cells / width
