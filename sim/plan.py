@@ -19,6 +19,7 @@ from sim.solvers import solver_class
 RATES = {
     (2, "water"): 10e6, (2, "sand"): 12e6, (2, "goop"): 11e6, (2, "elastic"): 15e6, (2, "snow"): 8.5e6, (2, "rigid"): 10e6,
     (3, "water"): 15e6, (3, "sand"): 2.7e6, (3, "goop"): 2.7e6, (3, "elastic"): 9e6, (3, "snow"): 2.7e6, (3, "rigid"): 15e6,
+    (2, "pbf"): 1e6, (3, "pbf"): 0.2e6,
     (2, "wcsph"): 3.5e6, (3, "wcsph"): 1.5e6, (2, "dfsph"): 2e6, (3, "dfsph"): 1.2e6,
 }
 

@@ -216,7 +216,24 @@ class Incompressible(_Strict):
     xsph: Annotated[float, Field(ge=0, lt=1)] = 0.05
 
 
-Solver = Annotated[MaterialPoints | WeaklyCompressible | Incompressible, Field(discriminator="method")]
+class PositionBased(_Strict):
+    """Position-based fluid and rigid bodies (``sim.pbd.solver``).
+
+    support [particle spacings]; substeps of a frame at least (FleX takes two); density_error: mean error, relative density, at which a solve ends;
+    iterations of a solve at most; xsph: share of the neighbours' mean velocity that a particle takes on in every step (0.01 as published);
+    tensile: strength of s_corr, which parts pairs that are closer than the spacing: at 0.01 the closest of water at rest are 0.89 of it apart instead of
+    0.77, above 0.02 it does not come to rest."""
+
+    method: Literal["pbf"]
+    support: _Support = 2.0
+    substeps: Annotated[int, Field(ge=1, le=1000)] = 2
+    density_error: Annotated[float, Field(gt=0, le=0.1)] = 1e-3
+    iterations: Annotated[int, Field(ge=1, le=10_000)] = 1000
+    xsph: Annotated[float, Field(ge=0, lt=1)] = 0.01
+    tensile: Annotated[float, Field(ge=0, le=0.02)] = 0.01
+
+
+Solver = Annotated[MaterialPoints | WeaklyCompressible | Incompressible | PositionBased, Field(discriminator="method")]
 
 
 class Splits(_Strict):
@@ -306,6 +323,8 @@ class _Physics(_Strict):
     def _check_solver(self) -> None:
         """What the chosen solver cannot do, or needs."""
         method = self.solver.method
+        if method == "pbf":
+            return self._check_position_based()
         axes = "xyz"[: self.dim]
         for index, axis in enumerate(self.periodic):
             if method == "mpm" or axis not in axes or axis in self.periodic[:index]:
@@ -332,6 +351,25 @@ class _Physics(_Strict):
                 raise _mistake(f"materials.{name}.model", material.model, "SPH moves water and rigid bodies; MPM (leave solver out) all materials")
             if method in ("mpm", "wcsph") and isinstance(material, Water) and material.sound_speed is None:
                 raise _mistake(f"materials.{name}.sound_speed", None, f"missing, and {method} needs it: at least ten times the largest speed")
+
+
+    def _check_position_based(self) -> None:
+        if self.periodic:
+            raise _mistake("periodic", self.periodic, "position-based scenes have walls all around; leave it out or choose solver.method dfsph")
+        if self.walls.friction != 0 or self.walls.velocity:
+            key = "friction" if self.walls.friction != 0 else "velocity"
+            raise _mistake(f"walls.{key}", getattr(self.walls, key), "position-based walls slip and stand still; leave it out")
+        if obstacles := getattr(self, "obstacles", []):
+            raise _mistake("obstacles", [obstacle.kind for obstacle in obstacles], "position-based scenes have none; choose solver.method dfsph or leave it out")
+        waters = [name for name, material in self.materials.items() if material.model == "water"]
+        for name, material in self.materials.items():
+            where = f"materials.{name}"
+            if material.model not in ("water", "rigid"):
+                raise _mistake(f"{where}.model", material.model, "position-based scenes hold water and rigid bodies; MPM (leave solver out) all materials")
+            if name in waters[1:]:
+                raise _mistake(f"{where}.model", "water", f"position-based scenes hold one kind of water, here {waters[0]}; leave one out")
+            if getattr(material, "viscosity", 0):
+                raise _mistake(f"{where}.viscosity", material.viscosity, "position-based water has none but solver.xsph; use 0, or solver.method dfsph")
 
 
 class _FamilyModel(_Physics):

@@ -9,6 +9,10 @@ def solver_class(method: str) -> type:
         from sim.sph.solver import SPHSimulator
 
         return SPHSimulator
+    if method == "pbf":
+        from sim.pbd.solver import PBDSimulator
+
+        return PBDSimulator
     from sim.mpm.solver import MPMSimulator
 
     return MPMSimulator
