@@ -15,8 +15,8 @@ SOLVERS = {method: SPHSimulator() for method in ("wcsph", "dfsph")}
 def scene(method, obstacles, lower, upper, cells=(40, 40), **changes):
     dim = len(cells)
     content = {
-        "name": "solids", "dim": dim, "bounds": [[0.0, 1.0]] * dim, "gravity": [0.0, -9.8, 0.0][:dim], "frame_step": 0.01, "frames": 100, "radius": 0.05,
-        "cells": list(cells), "particles_per_cell": 1, "seed": 0, "solver": {"method": method},
+        "name": "solids", "dim": dim, "bounds": [[0.0, 1.0]] * dim, "gravity": [0.0, -9.8, 0.0][:dim], "frame_step": 0.01, "frames": 100,
+        "radius": 0.05, "cells": list(cells), "particles_per_cell": 1, "seed": 0, "solver": {"method": method},
         "materials": {"water": {"model": "water", "sound_speed": 30.0}}, "obstacles": obstacles,
         "bodies": [{"material": "water", "kind": "box", "lower": lower, "upper": upper, "velocity": [0.0] * dim}],
     }  # fmt: skip
@@ -67,8 +67,8 @@ def test_water_over_an_obstacle_is_water_over_a_floor(method):
 
 @pytest.mark.physics
 def test_spheres_and_meshes_in_three_dimensions():
-    """Water falls on a ball and on a box that is a mesh: it ends beside them, never in them, but for what the distance between nodes is off
-    by where it is interpolated, spacing^2 / (4 radius) on the ball."""
+    """Water falls on a ball and on a box that is a mesh: it ends beside them, never in them, but for what the distance is off by where it is
+    interpolated between nodes a spacing apart: most at an edge of the box, 0.15 spacings at a right angle halfway between nodes."""
     corners = np.stack(np.meshgrid([0.6, 0.9], [0.2, 0.5], [0.3, 0.7], indexing="ij"), -1).reshape(-1, 3)
     quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
     triangles = [list(each) for a, b, c, d in quads for each in ((a, b, c), (a, c, d))]
@@ -79,7 +79,7 @@ def test_spheres_and_meshes_in_three_dimensions():
     n = len(what.particles().position)
     for _ in range(150):
         position = solver.frame()[:n]
-        assert clearance(what, position).min() > -0.1 * what.spacing
+        assert clearance(what, position).min() > -0.2 * what.spacing
     assert np.isfinite(position).all() and np.median(position[:, 1]) < 0.3, "most of it has fallen past"
 
 
