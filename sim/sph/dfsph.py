@@ -20,6 +20,7 @@ Viscosity is implicit, whatever its size: conjugate gradients for u + dt nu A su
 ``sim.sph.kernel.viscous_weight``). Each pair's force is along its line, so angular momentum is kept.
 """
 
+from sim.mpm.decomposition import finite
 from sim.taichi_runtime import ti
 
 #: Iterations of a solve at least.
@@ -328,7 +329,7 @@ class DFSPH:
 
     @ti.func
     def limit(self, n, g):
-        """Largest step, that moves particles by a share of a spacing; and the largest speed.
+        """Largest step, that moves particles by a share of a spacing; the largest speed; whether all are finite, which the largest does not tell.
 
         To their speed and what gravity adds comes c = sqrt(2 mean k), sqrt(g H) for water at rest: the density of a particle does not change with its
         own place at first order, so pressures hold it only by their curvature, k W'' ~ k / spacing^2, a spring whose frequency is c /
@@ -336,12 +337,13 @@ class DFSPH:
         over a step, hence the bound by fall and depth.
         """
         base = self.base
-        fast, total = 0.0, 0.0
+        fast, total, every = 0.0, 0.0, 0.0
         for i in range(n):
             u = base.v[i]
             u[3] = 0.0
             fast = ti.max(fast, u.norm_sqr())
             total += self.pressure[i][1]
+            every += u.norm_sqr()
         deep = 0.0
         for d in ti.static(range(self.dim)):
             deep += ti.abs(g[d]) * (base.extent[1][d] - base.extent[0][d])
@@ -351,14 +353,15 @@ class DFSPH:
         way = base.number[base.CFL] * base.number[base.SPACING]
         pull = g.norm()
         # speed dt + pull dt^2 = way.
-        return 2.0 * way / ti.max(speed + ti.sqrt(speed * speed + 4.0 * pull * way), 1e-12), fast
+        return 2.0 * way / ti.max(speed + ti.sqrt(speed * speed + 4.0 * pull * way), 1e-12), fast, finite(every + total)
 
     @ti.func
     def step(self, n, dt, g, report: ti.template()):
-        base = self.base
+        """One step, of no length densities alone. Returns how many solves did not converge."""
+        base, unsolved = self.base, 0
         base.list_pairs(n, report)
         self.gather(n)
-        for which in range(2):
+        for which in range(ti.select(dt > 0.0, 2, 0)):
             if which == 1:
                 for i in range(n):
                     base.v[i] += dt * g
@@ -367,12 +370,14 @@ class DFSPH:
                 if ti.static(self.structure.viscous):
                     taken, left = self.thicken(n, dt, ti.cast(base.number[base.ITERATIONS], ti.i32))
                     report[base.THICKENED] += ti.cast(taken, ti.f64)
-                    report[base.UNSOLVED] += ti.cast(not left <= VISCOUS_ERROR, ti.f64)
+                    report[base.VISCOUS] = ti.max(report[base.VISCOUS], ti.cast(left, ti.f64))
+                    unsolved += ti.cast(not left <= VISCOUS_ERROR, ti.i32)
             tolerance = ti.select(which == 1, base.number[base.DENSITY_ERROR], base.number[base.DIVERGENCE_ERROR])
             iterations, error = self.solve(n, which, dt, tolerance, ti.cast(base.number[base.ITERATIONS], ti.i32))
             report[base.SOLVED + which] += ti.cast(iterations, ti.f64)
             report[base.ERROR + which] = ti.max(report[base.ERROR + which], ti.cast(error, ti.f64))
-            report[base.UNSOLVED] += ti.cast(not error <= tolerance, ti.f64)
+            unsolved += ti.cast(not error <= tolerance, ti.i32)
         for i in range(n):
             base.x[i] += dt * base.v[i]
             base.enclose(i)
+        return unsolved

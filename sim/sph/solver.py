@@ -23,10 +23,11 @@ from sim.sph.neighbours import FEWEST, SKIN, Neighbours
 from sim.sph.wcsph import WCSPH
 from sim.taichi_runtime import compiling, start_taichi, ti
 
-#: Halvings of the planned step before a trajectory is given up.
+#: Halvings of the step planned at a frame's start before a trajectory is given up. A step that has to be shorter, for speeds that run away or for
+#: solves that do not end, ends the frame too: no frame takes more than 2^6 times the steps planned.
 MAX_HALVINGS = 6
-#: Steps of a frame at most, as a multiple of those planned at its start: speeds that run away shorten steps for ever.
-MOST_STEPS = 64
+#: A fixed time step ends a trajectory when it exceeds the limit at that moment by this factor.
+GROWTH = 1.5
 #: Share of the box from which on water counts as filling it, without a free surface.
 FULL = 0.999
 #: Distance to a wall in support radii from which on its drag grows no more.
@@ -65,9 +66,11 @@ class _Kernels:
     #: Places in ``number``.
     (COUNT, VOLUME, KERNEL, SPACING, CFL, SOUND, GAMMA, VISCOSITY, ALPHA, DELTA, DENSITY_ERROR, DIVERGENCE_ERROR, ITERATIONS, THICKNESS, XSPH,
      NUMBERS) = range(16)
-    #: Places in a frame's report; gravity and the frame's length are read from it.
-    STEPS, STEP, SPEED, SOLVED, ERROR, UNSOLVED, KINETIC, POTENTIAL, ELASTIC, DENSEST, BROKEN, FULL, LISTED, THICKENED, GRAVITY, SPAN, CAP, REPORT = (
-        0, 1, 2, 3, 5, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16, 19, 20, 21)
+    #: Places in a frame's report. Read from it are gravity, its change since the frame before, the frame's length, the longest step and whether
+    #: all are to be so long, and the limit below which the frame ends.
+    (STEPS, STEP, SPEED, SOLVED, ERROR, UNSOLVED, KINETIC, POTENTIAL, ELASTIC, DENSEST, BROKEN, FULL, LISTED, THICKENED, VISCOUS, OUTSIDE, LAST,
+     LIMIT) = (0, 1, 2, 3, 5, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16, 17, 18, 19)
+    GRAVITY, CHANGE, SPAN, CAP, FIXED, FLOOR, REPORT = 20, 23, 26, 27, 28, 29, 30
 
     def __init__(self, structure: Structure, capacity: int, cells: int, pairs: int, nodes: tuple[int, ...]):
         self.structure, self.capacity, self.dim, self.periodic = structure, capacity, structure.dim, structure.periodic
@@ -92,7 +95,8 @@ class _Kernels:
     def look(self, s):
         """``wall_table`` at a distance s <= 1."""
         u = ti.max(s, 0.0) * float(ENTRIES)
-        k = ti.cast(u, ti.i32)
+        # NaN is any index.
+        k = ti.min(ti.max(ti.cast(u, ti.i32), 0), ENTRIES)
         f = u - ti.cast(k, ti.f32)
         return (1.0 - f) * self.table[k] + f * self.table[k + 1]
 
@@ -204,45 +208,50 @@ class _Kernels:
 
     # -- kernels
     @ti.kernel
-    def frame(self, keep: ti.i32, steps: ti.i32, position: ti.types.ndarray(ti.f32, 2), report: ti.types.ndarray(ti.f64, 1)):
-        """One frame of at most so many steps; ``keep`` saves the state first."""
+    def frame(self, keep: ti.i32, position: ti.types.ndarray(ti.f32, 2), report: ti.types.ndarray(ti.f64, 1)):
+        """One frame, up to the first step that is not sound; of no span, what the start is like. ``keep`` saves the state first."""
         ti.loop_config(serialize=True)
         for _ in range(1):
             n = ti.cast(self.number[self.COUNT], ti.i32)
+            outside = 0
             for i in range(keep * n):
                 for f in ti.static(range(len(self.state))):
                     self.saved[f][i] = self.state[f][i]
                 self.saved_id[i] = self.id[i]
-            g = ti.Vector.zero(ti.f32, 4)
+                x = self.x[i]
+                for d in ti.static(range(self.dim)):
+                    outside += ti.cast(x[d] < self.extent[0][d] - HAIR, ti.i32) + ti.cast(x[d] > self.extent[1][d] + HAIR, ti.i32)
+            g, change = ti.Vector.zero(ti.f32, 4), ti.Vector.zero(ti.f32, 4)
             for d in ti.static(range(self.dim)):
-                g[d] = ti.cast(report[self.GRAVITY + d], ti.f32)
-            span, cap = ti.cast(report[self.SPAN], ti.f32), ti.cast(report[self.CAP], ti.f32)
-            left, taken = span, 0
-            # A new state knows no accelerations yet: a step of no length finds them.
-            fresh = self.neighbours.count[None] == 0 and ti.static(self.structure.method == "wcsph")
-            while left > 1e-6 * span and taken < steps and self.neighbours.count[None] < self.neighbours.other.shape[0]:
-                limit, fast = self.scheme.limit(n, g)
-                dt = ti.min(limit, cap)
-                # Steps divide what is left of the frame.
-                dt = left / ti.max(ti.ceil(left / dt - 1e-4), 1.0)
-                if fresh:
-                    dt = 0.0
-                self.scheme.step(n, dt, g, report)
-                if not fresh:
+                g[d], change[d] = ti.cast(report[self.GRAVITY + d], ti.f32), ti.cast(report[self.CHANGE + d], ti.f32)
+            if ti.static(self.structure.method == "wcsph"):
+                self.scheme.lean(n, change)
+            span, cap, floor = ti.cast(report[self.SPAN], ti.f32), ti.cast(report[self.CAP], ti.f32), ti.cast(report[self.FLOOR], ti.f32)
+            fixed, least, fastest, limit, last = report[self.FIXED] > 0.0, span, 0.0, 0.0, 0.0
+            left, taken, unsolved, sound, begun = span, 0, 0, outside == 0, False
+            while sound and (left > 1e-6 * span or not begun):
+                bound, fast, steady = self.scheme.limit(n, g)
+                limit, begun = bound, True
+                sound = steady and limit >= floor
+                if sound:
+                    dt = cap if fixed else ti.min(limit, cap)
+                    # Steps divide what is left of the frame.
+                    dt = left / ti.max(ti.ceil(left / dt - 1e-4), 1.0)
+                    unsolved += self.scheme.step(n, dt, g, report)
                     left -= dt
-                    taken += 1
-                    report[self.STEP] = ti.min(report[self.STEP], ti.cast(dt, ti.f64))
-                    report[self.SPEED] = ti.max(report[self.SPEED], ti.cast(fast, ti.f64))
-                fresh = False
-            report[self.STEPS] = ti.cast(taken, ti.f64)
-            report[self.BROKEN] += ti.cast(left > 1e-6 * span, ti.f64)
+                    taken += ti.cast(dt > 0.0, ti.i32)
+                    last, least, fastest = dt, ti.min(least, dt), ti.max(fastest, fast)
+                    sound = (unsolved == 0 or floor == 0.0) and self.neighbours.count[None] < self.neighbours.other.shape[0]
+            report[self.STEPS], report[self.STEP], report[self.SPEED] = ti.cast(taken, ti.f64), ti.cast(least, ti.f64), ti.cast(fastest, ti.f64)
+            report[self.LAST], report[self.LIMIT] = ti.cast(last, ti.f64), ti.cast(limit, ti.f64)
+            report[self.UNSOLVED], report[self.OUTSIDE] = ti.cast(unsolved, ti.f64), ti.cast(outside, ti.f64)
             report[self.FULL] = ti.cast(self.neighbours.count[None] >= self.neighbours.other.shape[0], ti.f64)
-            self.sum_up(n, position, report)
+            self.sum_up(n, not sound, position, report)
 
     @ti.func
-    def sum_up(self, n, position: ti.template(), report: ti.template()):
+    def sum_up(self, n, broken, position: ti.template(), report: ti.template()):
         """Positions [support radii] in the order of the scene; energies per mass of a particle."""
-        kinetic, height, fast, dense, broken = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64), 0.0, 0.0, 0
+        kinetic, height, squeeze, fast, dense, wrong = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64), 0.0, 0.0, 0
         for i in range(n):
             x, u = self.x[i], self.v[i]
             place = 0.0
@@ -256,11 +265,16 @@ class _Kernels:
             rho = u[3]
             if ti.static(self.structure.method == "dfsph"):
                 rho = self.scheme.wall[i][3]
+            else:
+                # Of p = c^2 / gamma (rho^gamma - 1): the integral of p / rho^2 from rest, which is small beside its terms.
+                r, gamma, c = ti.cast(rho, ti.f64), ti.cast(self.number[self.GAMMA], ti.f64), ti.cast(self.number[self.SOUND], ti.f64)
+                gain = ti.log(r) if gamma == 1.0 else (ti.pow(r, gamma - 1.0) - 1.0) / (gamma - 1.0)
+                squeeze += c * c / gamma * (gain + 1.0 / r - 1.0)
             dense = ti.max(dense, rho)
-            broken += ti.cast(not finite(x[0] + x[1] + x[2] + speed2 + rho), ti.i32)
-        report[self.KINETIC], report[self.POTENTIAL], report[self.DENSEST] = kinetic, height, ti.cast(dense, ti.f64)
+            wrong += ti.cast(not finite(x[0] + x[1] + x[2] + speed2 + rho) or rho <= 0.0, ti.i32)
+        report[self.KINETIC], report[self.POTENTIAL], report[self.ELASTIC], report[self.DENSEST] = kinetic, height, squeeze, ti.cast(dense, ti.f64)
         report[self.SPEED] = ti.max(report[self.SPEED], ti.cast(ti.sqrt(fast), ti.f64))
-        report[self.BROKEN] += ti.cast(broken, ti.f64)
+        report[self.BROKEN] = ti.cast(wrong + ti.cast(broken, ti.i32), ti.f64)
 
     @ti.kernel
     def load(self, data: ti.types.ndarray(ti.f32, 2), numbers: ti.types.ndarray(ti.f32, 2), table: ti.types.ndarray(ti.f32, 2)):
@@ -319,14 +333,18 @@ class SPHSimulator:
     Overrides make the rungs of a solver ladder: ``cfl`` (Courant number; default the scene's), ``particles`` ("teacher": refined as the scene
     says; "recorded": the tracked set alone), ``tolerance`` (factor on the errors at which DFSPH's solves end), ``stiffness`` (factor on the
     square of WCSPH's speed of sound), ``perturbation`` (length: random displacement of the start, for the chaos floor).
+
+    A scene's ``time_step`` holds unless ``cfl`` is given. ``unguarded_step`` [s] is for ``sim.stability`` alone: a fixed step that nothing
+    refuses or shortens, pressures that did not converge included, to see where the solver really becomes unstable.
     """
 
     def __init__(self, *, name: str = "sph", kind: Kind = "reference", cfl: float | None = None, particles: str = "teacher", tolerance: float = 1.0,
-                 stiffness: float = 1.0, perturbation: float = 0.0):
+                 stiffness: float = 1.0, perturbation: float = 0.0, unguarded_step: float | None = None):
         if particles not in ("teacher", "recorded"):
             raise InputError(name, "particles", particles, "must be teacher or recorded")
         self.name, self.kind = name, kind
         self.settings = {"cfl": cfl, "particles": particles, "tolerance": tolerance, "stiffness": stiffness, "perturbation": perturbation}
+        self.unguarded_step = unguarded_step
         self.compile_seconds = 0.0
         self._built: tuple | None = None
 
@@ -415,10 +433,12 @@ class SPHSimulator:
             "gravity": 0.25 * np.sqrt(support / 2 / max(gravity, tiny)),
         }  # fmt: skip
 
+    def _fixed(self, scene: Scene) -> float | None:
+        """The fixed time step [s], None for an adaptive one."""
+        return self.unguarded_step or (None if self.settings["cfl"] else scene.time_step)
+
     def _substeps(self, scene: Scene, speed: float) -> int:
-        step = min(self.limits(scene, speed).values())
-        if scene.time_step is not None and not self.settings["cfl"]:
-            step = scene.time_step
+        step = self._fixed(scene) or min(self.limits(scene, speed).values())
         return max(1, int(np.ceil(scene.frame_step / step - 1e-6)))
 
     def check_time_step(self, scene: Scene, where: object) -> None:
@@ -483,8 +503,10 @@ class SPHSimulator:
 
     # -- state
     def load(self, scene: Scene) -> None:
-        """Set the state of frame 0, compiling on first use. Raises ``InputError``."""
+        """Set the state of frame 0, compiling on first use. Raises ``InputError``, for a fixed time step above the limit at the start too."""
         begun = time.perf_counter()
+        if self.unguarded_step is None:
+            self.check_time_step(scene, scene.name)
         start_taichi()
         structure, (spacing, support, _) = self._structure(scene), self._layout(scene)
         particles = scene.particles(self._refine(scene))
@@ -515,31 +537,41 @@ class SPHSimulator:
             table[:, [SLOPE, NORMAL, TANGENT, SPREAD]] *= lattice_slope(dim, spacing / support)
         table = table.astype(np.float32)
         with compiling(dim):
+            if not fits:
+                self._kernels.restore(n)
             self._kernels.load(data, numbers.astype(np.float32), table)
             if structure.obstacles:
                 nodes = np.stack(np.meshgrid(*[np.arange(count) for count in sizes[3]], indexing="ij"), -1).reshape(-1, dim)
                 distance, normal, _ = combine(scene.surfaces, lower + nodes * spacing)
                 self._kernels.load_solids(np.column_stack([normal, distance / support]).astype(np.float32))
-            self._run(0.0, np.inf, 0, keep=True)
-            if not fits:
-                self._kernels.restore(n)
+            self._settle()
         if not fits:
             self.compile_seconds += time.perf_counter() - begun
 
-    def _run(self, span: float, cap: float, steps: int, keep: bool) -> np.ndarray:
+    def _felt(self) -> np.ndarray:
+        """Gravity as the box feels it in the current frame [length / s^2]."""
+        return np.array(self._scene.gravity) - self._acceleration[min(self._frame, len(self._acceleration) - 1)]
+
+    def _settle(self) -> None:
+        """Forces, densities and diagnostics of a start."""
+        self._pull = self._felt()
+        self._run(0.0, 1.0, 0.0, keep=True)
+
+    def _run(self, span: float, cap: float, floor: float, keep: bool) -> np.ndarray:
+        """A frame of so many seconds, in steps of at most ``cap``, or of just that where it is fixed; given up where the limit is below ``floor``."""
         k, scene = _Kernels, self._scene
-        report = np.zeros(k.REPORT)
-        report[k.STEP] = span
-        felt = np.array(scene.gravity) - self._acceleration[min(self._frame, len(self._acceleration) - 1)]
-        report[k.GRAVITY : k.GRAVITY + scene.dim] = felt / self._support
-        report[k.SPAN], report[k.CAP] = span, min(cap, 1e30)
-        self._kernels.frame(int(keep), steps, self._position, report)
+        report, felt = np.zeros(k.REPORT), self._felt()
+        report[k.GRAVITY : k.GRAVITY + scene.dim], report[k.CHANGE : k.CHANGE + scene.dim] = felt / self._support, (felt - self._pull) / self._support
+        report[k.SPAN], report[k.CAP], report[k.FLOOR], report[k.FIXED] = span, cap, floor, self._fixed(scene) is not None
+        self._kernels.frame(int(keep), self._position, report)
         joule = self._mass * self._support**2
         self._diagnostics = {
             "kinetic_energy": report[k.KINETIC] * joule, "potential_energy": report[k.POTENTIAL] * joule,
             "max_speed": report[k.SPEED] * self._support, "substeps": report[k.STEPS], "dt": report[k.STEP], "density": report[k.DENSEST],
         }
-        if scene.solver.method == "dfsph":
+        if scene.solver.method == "wcsph":
+            self._diagnostics["elastic_energy"] = report[k.ELASTIC] * joule
+        else:
             self._diagnostics |= {
                 "iterations_divergence": report[k.SOLVED], "iterations_density": report[k.SOLVED + 1], "divergence_error": report[k.ERROR],
                 "density_error": report[k.ERROR + 1], "unsolved": report[k.UNSOLVED],
@@ -549,58 +581,99 @@ class SPHSimulator:
         return report
 
     def frame(self) -> np.ndarray:
-        """Advance one frame; positions of the recorded particles, kinematic ones last, [n, dim] float32. Raises ``SimulationError``."""
-        k, scene = _Kernels, self._scene
-        fixed = None if self.settings["cfl"] else scene.time_step
-        cap = fixed or np.inf
+        """Advance one frame; positions of the recorded particles, kinematic ones last, [n, dim] float32. Raises ``SimulationError``.
+
+        Each step obeys the limits as they are at its start. A frame with a step that was not sound is taken back and repeated with steps of
+        at most half of that one, down to the floor of ``MAX_HALVINGS``; where the step is fixed, it ends the trajectory.
+        """
+        k, scene, fixed = _Kernels, self._scene, self._fixed(self._scene)
+        felt = self._felt()
+        speed = self._diagnostics["max_speed"] + float(np.linalg.norm(felt)) * scene.frame_step
+        planned = scene.frame_step / self._substeps(scene, speed)
+        cap, floor = planned, planned / 2**MAX_HALVINGS
+        if fixed:
+            floor = 0.0 if self.unguarded_step else fixed / GROWTH
         for attempt in range(1 if fixed else MAX_HALVINGS + 1):
-            report = self._run(scene.frame_step, cap, self._most(), keep=attempt == 0)
-            if np.isfinite(report).all() and not report[k.BROKEN] and not report[k.UNSOLVED] and not report[k.FULL]:
-                self._frame += 1
+            report = self._run(scene.frame_step, fixed or (cap if attempt else scene.frame_step), floor, keep=attempt == 0)
+            if np.isfinite(report).all() and not report[k.BROKEN]:
+                self._frame, self._pull = self._frame + 1, felt
                 return self._recorded()
             self._kernels.restore(len(self._position))
-            cap = report[k.STEP] / 2 if report[k.STEP] > 0 else scene.frame_step / 2 ** (attempt + 1)
-        raise SimulationError(self._why(report))
+            short = not report[k.LIMIT] >= floor
+            cap = (cap if short else min(cap, report[k.LAST])) / 2
+            if report[k.OUTSIDE] or report[k.FULL] or cap < floor * (1 - 1e-6):
+                break
+        raise SimulationError(self._sick() or self._why(report, fixed, floor))
 
-    def _most(self) -> int:
-        return 100_000
+    def _sick(self) -> str | None:
+        """What of the state no frame can begin with: the first that is not finite, or particles off the box. None if it is sound."""
+        state = {name: values.reshape(len(values), -1) for name, values in self._carried().items()}
+        for name, values in state.items():
+            wrong = np.flatnonzero(~np.isfinite(values).all(1))
+            if len(wrong):
+                return f"{name} of particle {wrong[0]} is not finite" + (f", nor of {len(wrong) - 1} others" if len(wrong) > 1 else "")
+        hair = 2 * HAIR * self._support
+        lower, upper = np.array(self._scene.bounds).T
+        away = np.flatnonzero(((state["position"] < lower - hair) | (state["position"] > upper + hair)).any(1))
+        return f"particle {away[0]} is off the box, at {state['position'][away[0]].round(3).tolist()}" if len(away) else None
 
-    def _why(self, report: np.ndarray) -> str:
-        k = _Kernels
+    def _why(self, report: np.ndarray, fixed: float | None, floor: float) -> str:
+        """Why a frame from a sound state was given up."""
+        k, scene = _Kernels, self._scene
+        speed = report[k.SPEED] * self._support
         if report[k.FULL]:
-            return "particles have gathered beyond the room for pairs"
-        if report[k.UNSOLVED]:
+            return f"particles have gathered: they make more pairs than there is room for, {ROOM:g} times those of water at rest"
+        if report[k.UNSOLVED] and not self.unguarded_step:
             errors = ", ".join(f"{what} {report[k.ERROR + which]:.2g}" for which, what in enumerate(("divergence", "density")))
-            return f"pressures did not converge in {self._scene.solver.iterations} iterations ({errors}), at a step of {report[k.STEP]:.3g} s"
-        return f"time step fell below {report[k.STEP]:.3g} s without a finite, stable frame"
+            errors += f", viscosity {report[k.VISCOUS]:.2g}" if self._kernels.structure.viscous else ""
+            return f"pressures did not converge in {scene.solver.iterations} iterations ({errors}), at a step of {report[k.LAST]:.3g} s"
+        if fixed and report[k.LIMIT] < floor:
+            return f"the fixed time step {fixed:.3g} s is far above the limit {report[k.LIMIT]:.3g} s at a speed of {speed:.3g} m/s"
+        if fixed:
+            return f"the fixed time step {fixed:.3g} s gave no finite, stable frame"
+        return f"time step fell below {floor:.3g} s without a finite, stable frame, at a speed of {speed:.3g} m/s"
 
     def _recorded(self) -> np.ndarray:
         moving = (self._lower + self._position[self._tracked].astype(float) * self._support).astype(np.float32)
         return np.concatenate([moving, self._boundary])
 
     def diagnostics(self) -> dict[str, float]:
-        """Of the current frame: energies [J, per unit depth in 2D], max speed [m/s], substeps, shortest step dt [s], largest density over that at
-        rest; DFSPH: iterations of both solves, their largest mean errors, how many solves did not converge."""
+        """Of the current frame: energies [J, per unit depth in 2D; elastic: WCSPH], max speed [m/s], substeps, shortest step dt [s], largest density
+        over that at rest; DFSPH: iterations of both solves, their largest mean errors, how many solves did not converge."""
         return dict(self._diagnostics)
 
-    def state(self) -> dict[str, np.ndarray]:
-        """All simulated particles in the order of the scene, float64: ``position`` [length], ``velocity`` [length / s], [n, dim] each, ``density``
-        over that at rest, ``pressure`` [Pa], [n] each."""
+    def _carried(self) -> dict[str, np.ndarray]:
+        """What goes from step to step, as in ``state``."""
         kernels, n, dim, h = self._kernels, *self._position.shape, self._support
         order = np.argsort(kernels.id.to_numpy()[:n])
         x, v = kernels.x.to_numpy()[:n][order].astype(float), kernels.v.to_numpy()[:n][order].astype(float)
         found = {"position": self._lower + x[:, :dim] * h, "velocity": v[:, :dim] * h}
-        water = self._water(self._scene)
+        return found | ({"density": v[:, 3]} if self._scene.solver.method == "wcsph" else {})
+
+    def state(self) -> dict[str, np.ndarray]:
+        """All simulated particles in the order of the scene, float64: ``position`` [length], ``velocity`` [length / s], [n, dim] each, ``density``
+        over that at rest, ``pressure`` [Pa], [n] each."""
+        kernels, n, water, h = self._kernels, len(self._position), self._water(self._scene), self._support
+        order, found = np.argsort(kernels.id.to_numpy()[:n]), self._carried()
         if self._scene.solver.method == "wcsph":
-            rho = v[:, 3]
-            found["density"] = rho
-            found["pressure"] = water.density * x[:, 3] * rho**2 * h**2
+            found["pressure"] = water.density * kernels.x.to_numpy()[:n, 3][order].astype(float) * found["density"] ** 2 * h**2
         else:
             found["density"] = kernels.scheme.wall.to_numpy()[:n, 3][order].astype(float)
             k = kernels.scheme.pressure.to_numpy()[:n][order].astype(float)
             # A kernel of few neighbours finds less than all of a gradient.
-            found["pressure"] = k[:, 1] / lattice_slope(dim, self._layout(self._scene)[0] / h) * water.density * h**2
+            found["pressure"] = k[:, 1] / lattice_slope(self._scene.dim, self._layout(self._scene)[0] / h) * water.density * h**2
         return found
+
+    def inject(self, name: str, particle: int, value) -> None:
+        """Overwrite ``position``, ``velocity`` or (WCSPH) ``density`` of a particle, as ``state`` gives them. For studies of what happens then."""
+        kernels, h = self._kernels, self._support
+        field, lanes, content = {
+            "position": (kernels.x, slice(self._scene.dim), (value - self._lower) / h),
+            "velocity": (kernels.v, slice(self._scene.dim), np.divide(value, h)), "density": (kernels.v, 3, value),
+        }[name]  # fmt: skip
+        whole = field.to_numpy()
+        whole[np.flatnonzero(kernels.id.to_numpy()[: len(self._position)] == particle), lanes] = content
+        field.from_numpy(whole)
 
     def set_velocity(self, velocity: np.ndarray) -> None:
         """Replace the velocities [n, dim] of all particles. For starts that no scene describes."""
@@ -608,7 +681,7 @@ class SPHSimulator:
         values = kernels.v.to_numpy()
         values[:n, :dim] = (velocity / self._support)[kernels.id.to_numpy()[:n]]
         kernels.v.from_numpy(values)
-        kernels.neighbours.count[None] = 0
+        self._settle()
 
     # -- the Simulator contract
     def begin(self, start: Start) -> None:

@@ -18,6 +18,7 @@ flight is one), where they are inside.
 Time: velocity Verlet with predicted velocity and density (Springel 2005, section 4.2), one sweep over the pairs a step.
 """
 
+from sim.mpm.decomposition import finite
 from sim.sph.kernel import NORMAL, SHARE, SLOPE, SPREAD, TANGENT
 from sim.taichi_runtime import ti
 
@@ -154,23 +155,31 @@ class WCSPH:
 
     @ti.func
     def limit(self, n, g):
-        """Largest stable step: c of the densest particle, the viscosity, the largest acceleration (Monaghan 1989); and the largest speed."""
+        """Largest stable step: c of the densest particle, the viscosity, the largest acceleration (Monaghan 1989); the largest speed; whether
+        all are finite, which largest ones do not tell."""
         base = self.base
-        fast, strong, dense = 0.0, 0.0, 1.0
+        fast, strong, dense, total = 0.0, 0.0, 1.0, 0.0
         for i in range(n):
             u, a = base.v[i], self.rate[i]
             dense = ti.max(dense, u[3])
             u[3], a[3] = 0.0, 0.0
             fast, strong = ti.max(fast, u.norm_sqr()), ti.max(strong, a.norm_sqr())
+            total += u.norm_sqr() + a.norm_sqr()
         fast, strong = ti.sqrt(fast), ti.sqrt(strong)
         c = base.number[base.SOUND] * ti.pow(dense, 0.5 * (base.number[base.GAMMA] - 1.0))
         dt = base.number[base.CFL] * base.number[base.SPACING] / (c + fast)
         dt = ti.min(dt, 0.25 * ti.sqrt(0.5 / ti.max(strong, 1e-12)))
-        return ti.min(dt, 0.125 * 0.25 / ti.max(base.number[base.VISCOSITY], 1e-12)), fast
+        return ti.min(dt, 0.125 * 0.25 / ti.max(base.number[base.VISCOSITY], 1e-12)), fast, finite(total)
+
+    @ti.func
+    def lean(self, n, change):
+        """``rate`` when gravity has changed."""
+        for i in range(n):
+            self.rate[i] += change
 
     @ti.func
     def step(self, n, dt, g, report: ti.template()):
-        """One step; ``rate`` is that of its start, which a step of no length finds."""
+        """One step; ``rate`` is that of its start, which a step of no length finds. Returns how many solves failed: there are none."""
         base = self.base
         shift = 0.0
         if ti.static(self.structure.shifting):
@@ -201,3 +210,4 @@ class WCSPH:
             if ti.static(self.structure.shifting):
                 inside = self.crowd[i][3] > ti.static(INSIDE * self.dim)
             base.v[i][3] = ti.select(inside, base.v[i][3], ti.max(base.v[i][3], 1.0))
+        return 0
