@@ -20,7 +20,7 @@ from sim.simulator import Kind, SimulationError, Start
 from sim.sph.dfsph import DFSPH
 from sim.sph.kernel import DRAG, ENTRIES, NORMAL, SHARE, SLOPE, SPREAD, TANGENT, constant, lattice_scale, lattice_slope, viscous_scale, wall_table
 from sim.sph.neighbours import FEWEST, SKIN, Neighbours
-from sim.sph.wcsph import WCSPH
+from sim.sph.wcsph import LARGEST_COURANT, LARGEST_VISCOUS, WCSPH
 from sim.taichi_runtime import compiling, start_taichi, ti
 
 #: Halvings of the step planned at a frame's start before a trajectory is given up. A step that has to be shorter, for speeds that run away or for
@@ -420,7 +420,7 @@ class SPHSimulator:
     def limits(self, scene: Scene, speed: float) -> dict[str, float]:
         """Bounds on the time step [s] at a speed of particles [m/s], by what sets them (h: half the support radius).
 
-        WCSPH: cfl spacing / (c + |v|), h^2 / (8 nu), sqrt(h / |g|) / 4 (Monaghan 1992). DFSPH: |v| dt + |g| dt^2 = cfl spacing.
+        WCSPH: cfl spacing / (c + |v|), h / (2 c), h^2 / (16 nu), sqrt(h / |g|) / 4 (Monaghan 1992). DFSPH: |v| dt + |g| dt^2 = cfl spacing.
         """
         spacing, support, _ = self._layout(scene)
         tiny, gravity = np.finfo(float).tiny, float(np.linalg.norm(np.array(scene.gravity) - scene.acceleration(), axis=-1).max())
@@ -429,7 +429,8 @@ class SPHSimulator:
             return {"the Courant number": 2 * way / max(speed + np.sqrt(speed**2 + 4 * gravity * way), tiny)}
         sound = water.sound_speed * np.sqrt(self.settings["stiffness"])
         return {
-            "the Courant number": way / (sound + speed), "the viscosity": (support / 2) ** 2 / 8 / max(water.viscosity / water.density, tiny),
+            "the Courant number": way / (sound + speed), "the speed of sound": LARGEST_COURANT * support / 2 / sound,
+            "the viscosity": LARGEST_VISCOUS * (support / 2) ** 2 / max(water.viscosity / water.density, tiny),
             "gravity": 0.25 * np.sqrt(support / 2 / max(gravity, tiny)),
         }  # fmt: skip
 
@@ -459,7 +460,7 @@ class SPHSimulator:
         structure, (_, support, cells) = self._structure(scene), self._layout(scene)
         dim, method, particles = scene.dim, scene.solver.method, scene.particles(self._refine(scene))
         n, boxes, pairs, nodes = self._sizes(scene, structure, len(particles.position))
-        state = {"x": 16, "v": 16} | ({"pressure": 8} if method == "dfsph" else {"rate": 16, "rate before": 16})
+        state = {"x": 16, "v": 16} | ({"pressure": 8} if method == "dfsph" else {"rate": 16, "rate before": 16, "density rate before": 4})
         state |= {"crowd": 16} if structure.shifting else {}
         fields = {name: (size, n) for name, size in state.items()} | {f"moved {name}": (size, n) for name, size in state.items()}
         fields |= {f"saved {name}": (size, n) for name, size in state.items()} | {f"{name}id": (4, n) for name in ("", "moved ", "saved ")}

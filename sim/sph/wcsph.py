@@ -15,7 +15,9 @@ lone particles whose pressure was negative pulled each other to pieces.
 Shifting moves particles down the gradient of their concentration, by 2 max|u| dt grad C (Sun et al. 2017, eq. 10; u: beyond the mean, so that free
 flight is one), where they are inside.
 
-Time: velocity Verlet with predicted velocity and density (Springel 2005, section 4.2), one sweep over the pairs a step.
+Time: velocity Verlet with predicted velocity and density (Springel 2005, section 4.2), one sweep over the pairs a step. The density is predicted with
+the trend of its rate: without, sound of frequency w grew by (w dt)^4 / 4 a step, which density diffusion hid where there was enough of it; with, it
+is damped by (w dt)^4 / 8, up to w dt = 0.75.
 """
 
 from sim.mpm.decomposition import finite
@@ -24,6 +26,9 @@ from sim.taichi_runtime import ti
 
 #: Particles count as inside the fluid where sum_j V r . grad W exceeds this share of the dimension (Lee et al. 2008: 1.5 of 2).
 INSIDE = 0.75
+#: Largest c dt / h, whatever Courant number is asked for, and largest nu dt / h^2 (h = 1/2). On a lattice the fastest sound has w = 1.2 c / h, and
+#: the fastest decay by viscosity, which a predicted velocity bears up to a rate of 1 / dt, 12 nu / h^2 (``sim.stability``: sound_dt, viscosity_dt).
+LARGEST_COURANT, LARGEST_VISCOUS = 0.5, 1 / 16
 
 
 @ti.data_oriented
@@ -34,7 +39,8 @@ class WCSPH:
         self.base, self.dim, self.structure = base, base.dim, base.structure
         self.rate = ti.Vector.field(4, ti.f32, capacity)  # acceleration; lane 3: rate of the density
         self.before = ti.Vector.field(4, ti.f32, capacity)
-        self.state = [self.rate, self.before]
+        self.earlier = ti.Vector.field(1, ti.f32, capacity)  # rate of the density a step before
+        self.state = [self.rate, self.before, self.earlier]
         if self.structure.shifting:
             self.crowd = ti.Vector.field(4, ti.f32, capacity)  # gradient of the concentration; lane 3: minus the divergence of position
             self.state.append(self.crowd)
@@ -167,9 +173,9 @@ class WCSPH:
             total += u.norm_sqr() + a.norm_sqr()
         fast, strong = ti.sqrt(fast), ti.sqrt(strong)
         c = base.number[base.SOUND] * ti.pow(dense, 0.5 * (base.number[base.GAMMA] - 1.0))
-        dt = base.number[base.CFL] * base.number[base.SPACING] / (c + fast)
+        dt = ti.min(base.number[base.CFL] * base.number[base.SPACING] / (c + fast), 0.5 * LARGEST_COURANT / c)
         dt = ti.min(dt, 0.25 * ti.sqrt(0.5 / ti.max(strong, 1e-12)))
-        return ti.min(dt, 0.125 * 0.25 / ti.max(base.number[base.VISCOSITY], 1e-12)), fast, finite(total)
+        return ti.min(dt, 0.25 * LARGEST_VISCOUS / ti.max(base.number[base.VISCOSITY], 1e-12)), fast, finite(total)
 
     @ti.func
     def lean(self, n, change):
@@ -194,7 +200,11 @@ class WCSPH:
             shift = 2.0 * dt * ti.sqrt(shift)
         for i in range(n):
             a = self.rate[i]
-            self.before[i] = a
+            # What the rate of the density will be, if it changes on as it did.
+            trend = 2.0 * a[3] - self.earlier[i][0]
+            self.earlier[i][0] = a[3]
+            self.before[i] = ti.Vector([a[0], a[1], a[2], trend])
+            a[3] = 0.5 * (a[3] + trend)
             move = dt * base.v[i] + (0.5 * dt * dt) * a
             if ti.static(self.structure.shifting):
                 move -= ti.select(self.crowd[i][3] > ti.static(INSIDE * self.dim), shift, 0.0) * self.crowd[i]
@@ -210,4 +220,6 @@ class WCSPH:
             if ti.static(self.structure.shifting):
                 inside = self.crowd[i][3] > ti.static(INSIDE * self.dim)
             base.v[i][3] = ti.select(inside, base.v[i][3], ti.max(base.v[i][3], 1.0))
+            if dt == 0.0:
+                self.earlier[i][0] = self.rate[i][3]
         return 0

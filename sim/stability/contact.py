@@ -6,7 +6,7 @@ import numpy as np
 
 from sim.stability import Cell
 from sim.stability.courant import MATERIALS
-from sim.stability.driver import ROUGH, deep, follow, solver_for
+from sim.stability.driver import SPH, deep, follow, solver_for, way
 from sim.validation import scene
 
 CELLS, G = 16, 9.8
@@ -29,11 +29,11 @@ STARTS = {
 
 def run() -> list[Cell]:
     """Water and rubber, half a second, in 2D and 3D."""
-    cells = []
-    for dim, name in [(dim, name) for dim in (2, 3) for name in ("water", "elastic")]:
+    cells, materials = [], {name: MATERIALS[name] for name in ("water", "elastic")} | SPH
+    for dim, name in [(dim, name) for dim in (2, 3) for name in materials]:
         for start, bodies in STARTS.items():
             begun, into = time.perf_counter(), []
-            what = scene("contact", MATERIALS[name], bodies, [[0.0, 1.0]] * 2, [CELLS] * 2, 0.01, gravity=[0.0, -G], walls=ROUGH)
+            what = scene("contact", materials[name], bodies, [[0.0, 1.0]] * 2, [CELLS] * 2, 0.01, gravity=[0.0, -G], **way(name))
             if dim == 3:
                 what = deep(what, *bodies[0]["lower"][:1], *bodies[0]["upper"][:1])
             run = follow(what, 1)

@@ -3,7 +3,7 @@
 import time
 
 from sim.stability import BOUND, Cell
-from sim.stability.driver import ROUGH, deep, follow
+from sim.stability.driver import SPH, deep, follow, way
 from sim.validation import scene
 
 COURANT = (0.2, 0.4, 0.8, 1.2, 2.0, 2.8, 4.0)
@@ -22,14 +22,14 @@ EXPECTED = "bounded energy, or failed and said so"
 
 def run() -> list[Cell]:
     """Dropped from two cells above a rough floor, in 2D and 3D; energy at hand is what a fall to the floor would release."""
-    return [_drop(name, material, courant, dim) for dim, numbers in ((2, COURANT), (3, COURANT_3D)) for name, material in MATERIALS.items()
+    return [_drop(name, material, courant, dim) for dim, numbers in ((2, COURANT), (3, COURANT_3D)) for name, material in (MATERIALS | SPH).items()
             for courant in numbers]
 
 
 def _drop(name: str, material: dict, courant: float, dim: int) -> Cell:
     begun, cell = time.perf_counter(), f"{name}, C {courant:g}{', 3D' if dim == 3 else ''}"
     body = {"kind": "box", "lower": [0.375, LIFT], "upper": [0.375 + WIDTH, LIFT + HEIGHT], "velocity": [0.5, 0.0]}
-    what = scene("courant", material, [body], [[0.0, 1.0]] * 2, [CELLS] * 2, 0.01, gravity=[0.0, -G], cfl=courant, walls=ROUGH)
+    what = scene("courant", material, [body], [[0.0, 1.0]] * 2, [CELLS] * 2, 0.01, gravity=[0.0, -G], cfl=courant, **way(name))
     if dim == 3:
         what = deep(what, 0.375, 0.375 + WIDTH)
     run = follow(what, FRAMES[dim])

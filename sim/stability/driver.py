@@ -6,14 +6,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sim.mpm.solver import MPMSimulator
+from sim.generate import Teacher
 from sim.scene import Scene
 from sim.simulator import SimulationError
+from sim.solvers import solver_class
 from sim.stability import Series
 
 #: Walls of most scenes: one set of kernels a material.
 ROUGH = {"friction": 0.5}
-_solvers: dict[str, MPMSimulator] = {}
+#: Water of the other methods, as a material of ``scene`` by name; SPH has slip walls.
+SPH = {"wcsph": {"model": "water", "sound_speed": 20.0}, "dfsph": {"model": "water"}}
+_solvers: dict[str, Teacher] = {}
+
+
+def way(name: str) -> dict:
+    """What of a scene depends on its method: ``name`` is one of ``SPH``, or a material of MPM, whose walls are ``ROUGH``."""
+    return {"solver": {"method": name}} if name in SPH else {"walls": ROUGH}
 
 
 def deep(what: Scene, low: float, high: float) -> Scene:
@@ -57,13 +65,14 @@ class Run:
         return Series(("time [s]", "energy / energy at hand"), np.concatenate([[0.0], self.time]), (self.energy - self.energy[0]) / scale + 1)
 
 
-def solver_for(what: Scene) -> MPMSimulator:
+def solver_for(what: Scene) -> Teacher:
     """The solver that all scenes of this structure and grid share in a process: compiling one takes longer than most cells."""
-    solver = MPMSimulator()
+    solver = solver_class(what.solver.method)()
     key = repr((solver.plan(what)["cells"], solver._structure(what)))
     if key not in _solvers:
-        # A full box first: kernels are compiled again for more particles than they have seen.
+        # A box that is full but for a layer first: kernels are compiled again for more particles than they have seen.
         lower, upper = np.array(what.bounds).T.tolist()
+        upper[1] -= what.spacing
         full = {"material": next(iter(what.materials)), "kind": "box", "lower": lower, "upper": upper, "velocity": [0.0] * what.dim}
         solver.load(Scene.from_dict({key: value for key, value in what.to_dict().items() if key != "time_step"} | {"bodies": [full]}))
         _solvers[key] = solver
@@ -86,7 +95,7 @@ def follow(what: Scene, frames: int, prepare=None) -> Run:
             break
         rows.append(solver.diagnostics())
     column = {name: np.array([row[name] for row in rows]) for name in rows[0]}
-    energy = column["kinetic_energy"] + column["potential_energy"] + column["elastic_energy"]
+    energy = column["kinetic_energy"] + column["potential_energy"] + column.get("elastic_energy", 0.0)
     return Run(
         time=what.frame_step * np.arange(1, len(rows)), kinetic=column["kinetic_energy"][1:], energy=energy, speed=column["max_speed"][1:],
         substeps=column["substeps"][1:], dt=column["dt"][1:], position=position, status=status,

@@ -6,7 +6,7 @@ import numpy as np
 
 from sim.obstacles import combine
 from sim.stability import Cell
-from sim.stability.driver import ROUGH, deep, follow, solver_for
+from sim.stability.driver import SPH, deep, follow, solver_for, way
 from sim.validation import scene
 
 MATERIALS = {
@@ -25,7 +25,8 @@ TARGETS = {"floor": [], "plate": [PLATE]}
 
 def run() -> list[Cell]:
     """Each material thrown at the floor, and at a plate two cells thick, in 2D and 3D; and one that may not bear it."""
-    return [_thrown(name, MATERIALS[name], target, dim) for dim in (2, 3) for name in MATERIALS for target in TARGETS] + [
+    materials = MATERIALS | SPH
+    return [_thrown(name, materials[name], target, dim) for dim in (2, 3) for name in materials for target in TARGETS] + [
         _thrown("elastic, far too soft,", SOFT, "plate", may_fail=True)]
 
 
@@ -33,7 +34,7 @@ def _thrown(name: str, material: dict, target: str, dim: int = 2, may_fail: bool
     begun, cell = time.perf_counter(), f"{name} on a {target}{', 3D' if dim == 3 else ''}"
     body = {"kind": "box", "lower": [0.375, 0.5], "upper": [0.625, 0.75], "velocity": [0.0, -SPEED]}
     what = scene("impact", material, [body], [[0.0, 1.0]] * 2, [CELLS] * 2, 5e-4, gravity=[0.0, -G],
-                 obstacles=TARGETS[target], walls=ROUGH)
+                 obstacles=TARGETS[target], **way(name))
     if dim == 3:
         what = deep(what, 0.375, 0.625)
     run = follow(what, 60)

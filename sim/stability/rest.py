@@ -6,7 +6,7 @@ import numpy as np
 
 from sim.stability import Cell
 from sim.stability.courant import MATERIALS
-from sim.stability.driver import ROUGH, deep, follow, solver_for
+from sim.stability.driver import SPH, deep, follow, solver_for, way
 from sim.validation import scene
 
 STEPS, CELLS = 10_000, 16
@@ -19,10 +19,11 @@ EPS = float(np.finfo(np.float32).eps)
 def run() -> list[Cell]:
     """The lattice is jittered, so that nothing is symmetric."""
     cells = []
-    for dim, name in [(2, name) for name in MATERIALS] + [(3, name) for name in DEEP]:
+    materials = MATERIALS | SPH
+    for dim, name in [(2, name) for name in materials] + [(3, name) for name in DEEP]:
         begun = time.perf_counter()
         body = {"kind": "box", "lower": [0.375, 0.375], "upper": [0.625, 0.625]}
-        what = scene("rest", MATERIALS[name], [body], [[0.0, 1.0]] * 2, [CELLS] * 2, 0.01, jitter=0.2, walls=ROUGH)
+        what = scene("rest", materials[name], [body], [[0.0, 1.0]] * 2, [CELLS] * 2, 0.01, jitter=0.2, **way(name))
         if dim == 3:
             what = deep(what, 0.375, 0.625)
         solver = solver_for(what)
