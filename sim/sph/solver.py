@@ -26,8 +26,9 @@ from sim.taichi_runtime import compiling, start_taichi, ti
 #: Halvings of the step planned at a frame's start before a trajectory is given up. A step that has to be shorter, for speeds that run away or for
 #: solves that do not end, ends the frame too: no frame takes more than 2^6 times the steps planned.
 MAX_HALVINGS = 6
-#: A fixed time step ends a trajectory when it exceeds the limit at that moment by this factor.
-GROWTH = 1.5
+#: A fixed time step ends a trajectory when it exceeds the limit at that moment by this factor, from which on energies grow (``sim.stability``:
+#: sound_dt, fall_dt).
+GROWTH = 2.0
 #: Share of the box from which on water counts as filling it, without a free surface.
 FULL = 0.999
 #: Distance to a wall in support radii from which on its drag grows no more.
@@ -420,12 +421,15 @@ class SPHSimulator:
     def limits(self, scene: Scene, speed: float) -> dict[str, float]:
         """Bounds on the time step [s] at a speed of particles [m/s], by what sets them (h: half the support radius).
 
-        WCSPH: cfl spacing / (c + |v|), h / (2 c), h^2 / (16 nu), sqrt(h / |g|) / 4 (Monaghan 1992). DFSPH: |v| dt + |g| dt^2 = cfl spacing.
+        WCSPH: cfl spacing / (c + |v|), h / (2 c), h^2 / (16 nu), sqrt(h / |g|) / 4 (Monaghan 1992). DFSPH: (|v| + sqrt(|g| H)) dt + |g| dt^2 = cfl
+        spacing, H: height of the highest body.
         """
         spacing, support, _ = self._layout(scene)
         tiny, gravity = np.finfo(float).tiny, float(np.linalg.norm(np.array(scene.gravity) - scene.acceleration(), axis=-1).max())
         way, water = (self.settings["cfl"] or scene.cfl) * spacing, self._water(scene)
         if scene.solver.method == "dfsph":
+            pull = np.abs(np.array(scene.gravity) - scene.acceleration()).max(0)
+            speed += float(np.sqrt(max(pull @ np.subtract(*body.extent()[::-1]) for body in scene.bodies)))
             return {"the Courant number": 2 * way / max(speed + np.sqrt(speed**2 + 4 * gravity * way), tiny)}
         sound = water.sound_speed * np.sqrt(self.settings["stiffness"])
         return {

@@ -32,7 +32,7 @@ def run() -> list[Cell]:
     cells, materials = [], {name: MATERIALS[name] for name in ("water", "elastic")} | SPH
     for dim, name in [(dim, name) for dim in (2, 3) for name in materials]:
         for start, bodies in STARTS.items():
-            begun, into = time.perf_counter(), []
+            begun, into, expected = time.perf_counter(), [], EXPECTED
             what = scene("contact", materials[name], bodies, [[0.0, 1.0]] * 2, [CELLS] * 2, 0.01, gravity=[0.0, -G], **way(name))
             if dim == 3:
                 what = deep(what, *bodies[0]["lower"][:1], *bodies[0]["upper"][:1])
@@ -47,9 +47,13 @@ def run() -> list[Cell]:
                 into.append(max(float(np.max(-v[x < near], initial=0.0)), float(np.max(v[x > 1 - near], initial=0.0))))
             inside = bool(np.isfinite(run.position).all() and run.position.min() >= 0 and run.position.max() <= 1)
             # A node's velocity and its mirror image cancel to the last digits of the speeds they are made of.
-            right = run.ok and inside and max(into) <= np.finfo(np.float32).eps * max(run.speed.max(initial=0.0), 1.0)
+            sound = run.ok
+            if name == "dfsph" and len(np.unique(what.particles().position, axis=0)) < len(what.particles().position):
+                # Between particles in one place no pressure acts, and nothing holds water at its density.
+                expected, sound = f"{EXPECTED}; or failed for pressures that did not converge", run.ok or "pressures did not converge" in run.status
+            right = sound and inside and max(into) <= np.finfo(np.float32).eps * max(run.speed.max(initial=0.0), 1.0)
             observed = f"{'inside' if inside else 'outside'}, at most {max(into):.2g} m/s into a wall" if run.ok else run.status
             numbers = {"particles": len(run.position), "speed_into_wall": max(into), "fastest": float(run.speed.max(initial=0.0))}
             cell = f"{name}, {start}{', 3D' if dim == 3 else ''}"
-            cells.append(Cell("contact", cell, right, EXPECTED, observed, numbers, time.perf_counter() - begun))
+            cells.append(Cell("contact", cell, right, expected, observed, numbers, time.perf_counter() - begun))
     return cells

@@ -11,24 +11,26 @@ from sim.validation import scene
 
 STEPS, CELLS = 10_000, 16
 #: In 3D too: what carries a volume, and what carries a tensor.
-DEEP = ("water", "elastic")
+DEEP = ("water", "elastic", *SPH)
 #: Speed that is rounding alone: eps of the speed of sound a step, a random walk over all of them.
 EPS = float(np.finfo(np.float32).eps)
 
 
 def run() -> list[Cell]:
-    """The lattice is jittered, so that nothing is symmetric."""
+    """The lattice is jittered, so that nothing is symmetric; but not where density is held: there it would have to be evened out at once."""
     cells = []
     materials = MATERIALS | SPH
     for dim, name in [(2, name) for name in materials] + [(3, name) for name in DEEP]:
-        begun = time.perf_counter()
+        begun, jitter = time.perf_counter(), 0.0 if name == "dfsph" else 0.2
         body = {"kind": "box", "lower": [0.375, 0.375], "upper": [0.625, 0.625]}
-        what = scene("rest", materials[name], [body], [[0.0, 1.0]] * 2, [CELLS] * 2, 0.01, jitter=0.2, **way(name))
+        what = scene("rest", materials[name], [body], [[0.0, 1.0]] * 2, [CELLS] * 2, 0.01, jitter=jitter, **way(name))
         if dim == 3:
             what = deep(what, 0.375, 0.625)
         solver = solver_for(what)
         solver.load(what)
-        tolerance = EPS * solver.diagnostics()["wave_speed"] * np.sqrt(STEPS)
+        # DFSPH knows no speed of sound: positions of up to 16 kernels' radii are rounded, a step of the frame's length.
+        wave_speed = solver.plan(what)["wave_speed"] or 1.0 / what.frame_step
+        tolerance = EPS * wave_speed * np.sqrt(STEPS)
         frames = int(np.ceil(STEPS / solver.plan(what)["substeps_per_frame"][0]))
         run = follow(what, frames)
         steps, fastest = float(run.substeps.sum()), float(run.speed.max(initial=0.0))
