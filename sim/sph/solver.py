@@ -17,7 +17,7 @@ from sim.mpm.decomposition import finite
 from sim.obstacles import combine
 from sim.scene import Incompressible, Scene
 from sim.simulator import Kind, SimulationError, Start
-from sim.sph.dfsph import DFSPH
+from sim.sph.dfsph import DFSPH, VISCOUS_ERROR
 from sim.sph.kernel import DRAG, ENTRIES, NORMAL, SHARE, SLOPE, SPREAD, TANGENT, constant, lattice_scale, lattice_slope, viscous_scale, wall_table
 from sim.sph.neighbours import FEWEST, SKIN, Neighbours
 from sim.sph.wcsph import LARGEST_COURANT, LARGEST_VISCOUS, WCSPH
@@ -629,9 +629,10 @@ class SPHSimulator:
         if report[k.FULL]:
             return f"particles have gathered: they make more pairs than there is room for, {ROOM:g} times those of water at rest"
         if report[k.UNSOLVED] and not self.unguarded_step:
-            errors = ", ".join(f"{what} {report[k.ERROR + which]:.2g}" for which, what in enumerate(("divergence", "density")))
-            errors += f", viscosity {report[k.VISCOUS]:.2g}" if self._kernels.structure.viscous else ""
-            return f"pressures did not converge in {scene.solver.iterations} iterations ({errors}), at a step of {report[k.LAST]:.3g} s"
+            what = ", ".join(f"{what} {report[k.ERROR + which]:.2g}" for which, what in enumerate(("divergence", "density")))
+            what = f"viscosity did not converge in {{}} iterations ({report[k.VISCOUS]:.2g})" if report[k.VISCOUS] > VISCOUS_ERROR else (
+                f"pressures did not converge in {{}} iterations ({what})")  # fmt: skip
+            return f"{what.format(scene.solver.iterations)}, at a step of {report[k.LAST]:.3g} s"
         if fixed and report[k.LIMIT] < floor:
             return f"the fixed time step {fixed:.3g} s is far above the limit {report[k.LIMIT]:.3g} s at a speed of {speed:.3g} m/s"
         if fixed:

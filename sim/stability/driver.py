@@ -79,8 +79,9 @@ def solver_for(what: Scene) -> Teacher:
     return _solvers[key]
 
 
-def follow(what: Scene, frames: int, prepare=None) -> Run:
-    """Load a scene, let ``prepare(solver)`` change its start, and run; a failure of the solver ends the run with its status."""
+def follow(what: Scene, frames: int, prepare=None, observe=None) -> Run:
+    """Load a scene, let ``prepare(solver)`` change its start, and run, with ``observe(solver)`` after each frame; a failure of the solver ends
+    the run with its status."""
     solver = solver_for(what)
     solver.load(what)
     if prepare is not None:
@@ -94,6 +95,8 @@ def follow(what: Scene, frames: int, prepare=None) -> Run:
             status = f"failed: {error} (frame {number})"
             break
         rows.append(solver.diagnostics())
+        if observe is not None:
+            observe(solver)
     column = {name: np.array([row[name] for row in rows]) for name in rows[0]}
     energy = column["kinetic_energy"] + column["potential_energy"] + column.get("elastic_energy", 0.0)
     return Run(

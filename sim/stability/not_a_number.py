@@ -11,13 +11,16 @@ from sim.generate import generate, simulate
 from sim.scene import SceneFamily
 from sim.stability import Cell
 from sim.stability.courant import MATERIALS
-from sim.stability.driver import ROUGH, solver_for
+from sim.stability.driver import SPH, solver_for, way
 from sim.stability.refusal import FAMILY
 
 #: Frame before which a teacher goes wrong.
 WHEN = 4
-#: Material -> name of its deformation in ``MPMSimulator.state``.
-STATES = {"water": "stuff.J", "sand": "stuff.b - I"}
+#: What a material carries by ``state``, or water of a method.
+STATES = {
+    "water": ("position", "velocity", "velocity gradient", "stuff.J"), "sand": ("position", "velocity", "velocity gradient", "stuff.b - I"),
+    "wcsph": ("position", "velocity", "density"), "dfsph": ("position", "velocity"),
+}  # fmt: skip
 
 
 class Poisoned:
@@ -41,16 +44,16 @@ class Poisoned:
 
 
 def _family(name: str) -> SceneFamily:
-    changes = {"materials": {"stuff": MATERIALS[name]}, "frames": 8, "gravity": [0.0, -9.8], "walls": ROUGH}
-    return SceneFamily(FAMILY | changes, "nan.yaml")
+    changes = {"materials": {"stuff": (MATERIALS | SPH)[name]}, "frames": 8, "gravity": [0.0, -9.8]}
+    return SceneFamily(FAMILY | changes | way(name), "nan.yaml")
 
 
 def run() -> list[Cell]:
-    """Every field of two materials, then a data set."""
+    """Every field of two materials and of water by SPH, then data sets."""
     cells = []
-    for name, deformation in STATES.items():
+    for name, fields in STATES.items():
         teacher = Poisoned()
-        for where in ("position", "velocity", "velocity gradient", deformation):
+        for where in fields:
             for value in (np.nan, np.inf):
                 begun = time.perf_counter()
                 teacher.where, teacher.value = where, value
@@ -60,15 +63,16 @@ def run() -> list[Cell]:
                 cells.append(Cell("not_a_number", f"{name}, {value:g} in its {where.removeprefix('stuff.')}", right,
                                   "failed within the frame; the frames before it are sound", trajectory.status, {},
                                   time.perf_counter() - begun))  # fmt: skip
-    begun = time.perf_counter()
-    with tempfile.TemporaryDirectory() as place:
-        try:
-            generate(_family("water"), {"train": 2}, Path(place) / "out", teacher=Poisoned)
-            said = "accepted"
-        except RunError as error:
-            said = str(error).replace(f"{place}/", "")
-        files = sorted(path.name for path in Path(place).rglob("*.h5"))
-    right = "all 2 trajectories of train failed; the first: failed: " in said and not files
-    cells.append(Cell("not_a_number", "a data set of poisoned trajectories", right, "nothing written, every failure named", said,
-                      {"files": ", ".join(files) or None}, time.perf_counter() - begun))  # fmt: skip
+    for name in ("water", *SPH):
+        begun = time.perf_counter()
+        with tempfile.TemporaryDirectory() as place:
+            try:
+                generate(_family(name), {"train": 2}, Path(place) / "out", teacher=Poisoned)
+                said = "accepted"
+            except RunError as error:
+                said = str(error).replace(f"{place}/", "")
+            files = sorted(path.name for path in Path(place).rglob("*.h5"))
+        right = "all 2 trajectories of train failed; the first: failed: " in said and not files
+        cells.append(Cell("not_a_number", f"{name}, a data set of poisoned trajectories", right, "nothing written, every failure named", said,
+                          {"files": ", ".join(files) or None}, time.perf_counter() - begun))  # fmt: skip
     return cells
