@@ -670,15 +670,16 @@ class SPHSimulator:
             found["pressure"] = k[:, 1] / lattice_slope(self._scene.dim, self._layout(self._scene)[0] / h) * water.density * h**2
         return found
 
-    def inject(self, name: str, particle: int, value) -> None:
-        """Overwrite ``position``, ``velocity`` or (WCSPH) ``density`` of a particle, as ``state`` gives them. For studies of what happens then."""
+    def inject(self, name: str, particle: int | np.ndarray, value) -> None:
+        """Overwrite ``position``, ``velocity`` or (WCSPH) ``density`` of a particle, or of several, as ``state`` gives them. For studies of what
+        happens then."""
         kernels, h = self._kernels, self._support
         field, lanes, content = {
             "position": (kernels.x, slice(self._scene.dim), (value - self._lower) / h),
             "velocity": (kernels.v, slice(self._scene.dim), np.divide(value, h)), "density": (kernels.v, 3, value),
         }[name]  # fmt: skip
         whole = field.to_numpy()
-        whole[np.flatnonzero(kernels.id.to_numpy()[: len(self._position)] == particle), lanes] = content
+        whole[np.flatnonzero(np.isin(kernels.id.to_numpy()[: len(self._position)], particle)), lanes] = content
         field.from_numpy(whole)
 
     def set_velocity(self, velocity: np.ndarray) -> None:

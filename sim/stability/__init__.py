@@ -1,4 +1,4 @@
-"""The stress matrix: what the solver must do when it is asked for too much, one small file a case or family of cases.
+"""The stress matrix: what the solvers must do when it is asked for too much, one small file a case or family of cases.
 
 A case is a module of ``CASES`` with ``run() -> list[Cell]``; the first line of its docstring is its title. A cell says what reaction is right,
 what was observed, and whether that is it. ``configs/studies/stability.yaml`` runs all; ``sim.stability.report`` writes summary and page.
@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 CASES = (
-    "young_dt", "speed_dt", "refusal", "courant", "stiff", "poisson", "density_ratio", "impact", "few_particles", "contact", "seeding", "rest",
-    "friction_angle", "inverted", "shaking", "not_a_number", "resume",
+    "young_dt", "speed_dt", "sound_dt", "viscosity_dt", "fall_dt", "refusal", "courant", "stiff", "poisson", "density_ratio", "impact",
+    "few_particles", "contact", "seeding", "rest", "friction_angle", "inverted", "unsolved", "runaway", "shaking", "not_a_number", "resume",
 )
 #: Energy that counts as bounded, over the start's. Symplectic Euler swings about the true energy by up to 1 / (1 - (w dt / 2)^2); the fastest
 #: oscillation of the grid, w = 2 sqrt(2) c / dx in 2D, makes that 1.47 at the default Courant number of 0.4. An instability knows no bound.

@@ -20,25 +20,34 @@ FAMILY = {
     "cells": [CELLS, CELLS], "bodies": [{"material": "stuff", "shape": {"kind": "box", "size": [0.25, 0.25]}}],
     "splits": {"train": 2, "valid": 0, "test": 0},
 }
-#: What binds -> (materials, cfl, velocity, limit by hand [s]).
+#: Half the support radius of WCSPH, 1.25 spacings.
+H = 1.25 * 0.5 / CELLS
+#: What binds -> (materials, cfl, velocity, limit by hand [s]); of MPM, then of SPH.
 BINDING = {
     "the Courant number": ({"model": "water", "sound_speed": 20.0}, 0.4, 5.0, 0.4 / CELLS / 25.0),
     "the viscosity of stuff": ({"model": "water", "sound_speed": 5.0, "viscosity": 2000.0}, 0.4, 0.0, 1 / CELLS**2 * 1000.0 / (2 * 2 * 2000.0)),
     "a particle alone on the grid": ({"model": "water", "sound_speed": 20.0}, 2.0, 0.0, 0.8 / CELLS / (np.sqrt(2) * 20.0)),
 }
+BINDING_SPH = {
+    ("wcsph", "the Courant number"): ({"model": "water", "sound_speed": 20.0}, 0.4, 5.0, 0.4 * 0.5 / CELLS / 25.0),
+    ("wcsph", "the speed of sound"): ({"model": "water", "sound_speed": 20.0}, 2.0, 0.0, 0.5 * H / 20.0),
+    ("wcsph", "the viscosity"): ({"model": "water", "sound_speed": 5.0, "viscosity": 2000.0}, 0.4, 0.0, H**2 / 16 / 2.0),
+    ("dfsph", "the Courant number"): ({"model": "water"}, 0.4, 5.0, 0.4 * 0.5 / CELLS / 5.0),
+}
 
 
 def run() -> list[Cell]:
-    """Each of the three limits, just above and just below."""
-    cells = []
-    for what, (material, cfl, speed, limit) in BINDING.items():
+    """Each limit, just above and just below; a radius in which no particle has a neighbour."""
+    cells = [_radius()]
+    for (method, what), (material, cfl, speed, limit) in ({("mpm", what): given for what, given in BINDING.items()} | BINDING_SPH).items():
         begun = time.perf_counter()
         with tempfile.TemporaryDirectory() as place:
             path, out = Path(place) / "refusal.yaml", Path(place) / "out"
             steps = int(np.ceil(FRAME / limit))
 
-            def write(count: int, path=path, material=material, cfl=cfl, speed=speed) -> None:
+            def write(count: int, path=path, material=material, cfl=cfl, speed=speed, method=method) -> None:
                 content = copy.deepcopy(FAMILY) | {"materials": {"stuff": material}, "cfl": cfl, "time_step": FRAME / count}
+                content["solver"] = {"method": method}
                 content["bodies"][0]["velocity"] = [speed, 0.0]
                 path.write_text(yaml.safe_dump(content))
 
@@ -52,5 +61,19 @@ def run() -> list[Cell]:
         observed = f"above: exit {', '.join(str(code) for code, _ in answers)}, {'nothing' if left else 'something'} written; below: " + (
             "accepted" if accepted else "refused")  # fmt: skip
         numbers = {"limit": limit, "time_step": FRAME / (steps - 1), "said": answers[0][1].strip().replace(str(path), "refusal.yaml")}
-        cells.append(Cell("refusal", what, refused and left and accepted, EXPECTED, observed, numbers, time.perf_counter() - begun))
+        cell = what if method == "mpm" else f"{method}, {what}"
+        cells.append(Cell("refusal", cell, refused and left and accepted, EXPECTED, observed, numbers, time.perf_counter() - begun))
     return cells
+
+
+def _radius() -> Cell:
+    """The kernel's support is counted in spacings; the radius of the scene is what learners connect."""
+    begun = time.perf_counter()
+    with tempfile.TemporaryDirectory() as place:
+        path, out = Path(place) / "refusal.yaml", Path(place) / "out"
+        path.write_text(yaml.safe_dump(FAMILY | {"materials": {"stuff": {"model": "water"}}, "solver": {"method": "dfsph"}, "radius": 0.03}))
+        code, said = command("generate", path, "--out", out)
+        right = code == 2 and said.count("\n") == 1 and "radius = 0.03: below the particle spacing 0.03125" in said and not out.exists()
+        said = said.strip().replace(str(path), "refusal.yaml")
+    return Cell("refusal", "dfsph, radius below the spacing", right, "exit code 2, one line, nothing written", f"exit {code}: {said}", {},
+                time.perf_counter() - begun)  # fmt: skip

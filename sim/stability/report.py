@@ -20,8 +20,14 @@ from sim.trajectory import atomic_path
 _POINTS = 200
 _OUTCOMES = {"bounded": "energy bounded", "grew": "energy grew", "not finite": "failed and said so"}
 _COLOURS = {"bounded": "C0", "grew": "C1", "not finite": "C3"}
-#: Case -> (key of its map's other axis, that axis' name).
-MAPS = {"young_dt": ("young_modulus", "Young's modulus E [Pa]"), "speed_dt": ("speed", "speed v [m/s]")}
+#: Case -> (key of its map's other axis, that axis' name, the solver's limit, the step that Courant numbers are multiples of).
+MAPS = {
+    "young_dt": ("young_modulus", "Young's modulus E [Pa]", "0.4 dx / (c + v)", "dx / (c + v)"),
+    "speed_dt": ("speed", "speed v [m/s]", "0.4 dx / (c + v)", "dx / (c + v)"),
+    "sound_dt": ("sound_speed", "speed of sound c [m/s]", "0.4 d / c", "d / c"),
+    "viscosity_dt": ("viscosity", "kinematic viscosity [m2/s]", "h^2 / (16 nu)", "h^2 / nu"),
+    "fall_dt": ("speed", "speed v [m/s]", "(v + sqrt(g H)) dt + g dt^2 = 0.4 d", "= d"),
+}
 
 
 def _plain(value):
@@ -81,7 +87,7 @@ def map_figure(rows: Sequence[Mapping], case: str):
     """A map: every fixed step by what became of the energy, filled where it was accepted; the limits; the steps of the adaptive run."""
     from matplotlib.figure import Figure
 
-    key, name = MAPS[case]
+    key, name, bound, unit = MAPS[case]
     figure = Figure(figsize=(8, 5.2), layout="constrained")
     panel = figure.subplots()
     fixed = [one["numbers"] for one in rows if one["case"] == case and "courant" in one["numbers"]]
@@ -93,8 +99,8 @@ def map_figure(rows: Sequence[Mapping], case: str):
                        mfc="none" if refused else colour, label=f"{'refused' if refused else 'accepted'}; {_OUTCOMES[outcome]}")  # fmt: skip
     columns = {one[key]: one for one in fixed}
     x = sorted(columns)
-    panel.plot(x, [columns[each]["limit"] for each in x], "k-", lw=1.5, label="limit of the solver, 0.4 dx / (c + v)")
-    panel.plot(x, [columns[each]["time_step"] / columns[each]["courant"] for each in x], "k--", lw=1.2, label="dx / (c + v)")
+    panel.plot(x, [columns[each]["limit"] for each in x], "k-", lw=1.5, label=f"limit of the solver, {bound}")
+    panel.plot(x, [columns[each]["time_step"] / columns[each]["courant"] for each in x], "k--", lw=1.2, label=unit)
     adaptive = [one["numbers"] for one in rows if one["case"] == case and "courant" not in one["numbers"]]
     at = np.array([one[key] for one in adaptive])
     low, high = (np.array([one[name] for one in adaptive], float) for name in ("smallest_dt", "largest_dt"))

@@ -18,8 +18,8 @@ ROUNDING = 1e-4
 
 def _shaken(name: str, bodies: list[dict], frequency: float, phase: float, **changes) -> Scene:
     sines = [{"amplitude": [SHAKE, 0.0], "frequency": frequency, "phase": phase}]
-    return scene("shaking", WATER[name], bodies, [[0.0, 1.0]] * 2, [CELLS] * 2, FRAME, gravity=[0.0, -G], container={"sines": sines}, **way(name),
-                 **({"frames": 101} | changes))  # fmt: skip
+    return scene("shaking", WATER[name], bodies, [[0.0, 1.0]] * 2, [CELLS] * 2, FRAME, gravity=[0.0, -G], container={"sines": sines},
+                 **({"frames": 101} | way(name) | changes))  # fmt: skip
 
 
 def run() -> list[Cell]:
@@ -29,7 +29,9 @@ def run() -> list[Cell]:
 def _shake(name: str, of: str) -> list[Cell]:
     """Moving frame: with the box's displacement added, a body in free flight falls as if there were no box."""
     body = {"kind": "box", "lower": [0.375, 0.5], "upper": [0.625, 0.75]}
-    begun, what = time.perf_counter(), _shaken(name, [body], 8.0, 90.0)
+    # Density diffusion (Fourtakas et al. 2019) takes water to be at rest in what gravity it feels, and squeezes what flies by 1e-3 of its size.
+    still = {"solver": {"method": "wcsph", "density_diffusion": 0.0}} if name == "wcsph" else {}
+    begun, what = time.perf_counter(), _shaken(name, [body], 8.0, 90.0, **still)
     run, start = follow(what, 100), what.particles().position
     # The box starts at rest. Its velocity and place follow from the mean accelerations at the steps taken, as symplectic Euler adds them up;
     # velocity Verlet (WCSPH) follows them exactly, whatever its steps.
