@@ -346,9 +346,14 @@ class _Physics(_Strict):
             if method != "mpm" and obstacle.friction not in (None, self.walls.friction):
                 remedy = "in SPH scenes obstacles slip or hold water as the walls do; leave it out"
                 raise _mistake(f"obstacles[{index}].friction", obstacle.friction, remedy)
+        waters = [name for name, material in self.materials.items() if isinstance(material, Water)]
+        if method != "mpm" and not waters and all(isinstance(material, Rigid) for material in self.materials.values()):
+            raise _mistake("materials", list(self.materials), "SPH moves water, and rigid bodies in it; add water, or choose another solver.method")
         for name, material in self.materials.items():
             if method != "mpm" and material.model not in ("water", "rigid"):
                 raise _mistake(f"materials.{name}.model", material.model, "SPH moves water and rigid bodies; MPM (leave solver out) all materials")
+            if method != "mpm" and name in waters[1:]:
+                raise _mistake(f"materials.{name}.model", "water", f"SPH scenes hold one kind of water, here {waters[0]}; leave one out")
             if method in ("mpm", "wcsph") and isinstance(material, Water) and material.sound_speed is None:
                 raise _mistake(f"materials.{name}.sound_speed", None, f"missing, and {method} needs it: at least ten times the largest speed")
 

@@ -468,11 +468,11 @@ class SPHSimulator:
         state |= {"crowd": 16} if structure.shifting else {}
         fields = {name: (size, n) for name, size in state.items()} | {f"moved {name}": (size, n) for name, size in state.items()}
         fields |= {f"saved {name}": (size, n) for name, size in state.items()} | {f"{name}id": (4, n) for name in ("", "moved ", "saved ")}
-        fields |= {"cell": (4, n), "sorted place": (4, n), "first pair": (4, n), "place when listed": (16, n), "pairs": (4, pairs),
-                   "cells": (8, boxes)}
+        fields |= {"cell": (4, n), "sorted place": (4, n), "first pair": (4, n + 1), "place when listed": (16, n), "pairs": (4, pairs),
+                   "cell starts": (4, boxes + 2), "cell cursors": (4, boxes + 2), "numbers": (4, _Kernels.NUMBERS), "wall table": (24, ENTRIES + 2)}
         if method == "dfsph":
             fields |= {"pairs within reach": (4, pairs), "gradients": (16, pairs), "sums": (16, n), "wall": (16, n), "push": (16, n)}
-            fields |= {"source": (4, n), "members": (4, n), "first within reach": (4, n)}
+            fields |= {"source": (4, n), "members": (4, n), "first within reach": (4, n + 1), "pressure before": (4, n), "pressure after": (4, n)}
         fields |= {"krylov": (8, n)} if structure.full else {}
         if structure.viscous and method == "dfsph":
             fields |= {"drag": (4, pairs), "residual": (16, n), "search": (16, n), "image": (16, n)}
