@@ -16,6 +16,7 @@ from sim.mpm import solver as solver_module
 from sim.mpm.solver import MPMSimulator
 from sim.plan import plan
 from sim.scene import Scene, SceneFamily
+from sim.sph.solver import SPHSimulator
 from sim.stability import CASES, Cell, Series
 from sim.stability.driver import ROUGH, solver_for
 from sim.stability.report import row, title, verdict, write_report
@@ -37,7 +38,7 @@ def test_what_is_refused(name):
 
 
 @pytest.mark.physics
-@pytest.mark.parametrize("name", ["poisson", "density_ratio", "few_particles", "contact"])
+@pytest.mark.parametrize("name", ["poisson", "density_ratio", "few_particles", "contact", "runaway"])
 def test_a_case_reacts_as_it_should(name):
     cells = case(name).run()
     assert not wrong(cells) and {cell.case for cell in cells} == {name}
@@ -70,11 +71,53 @@ def test_a_limit_that_is_too_wide_is_found_wrong(small_map, monkeypatch):
     assert verdict([row(cell) for cell in cells]).startswith("2 of 5 cells")
 
 
+@pytest.fixture
+def small_sound_map(monkeypatch):
+    """The map of speeds of sound with one column and four steps, of which the last two are far beyond what holds."""
+    module = case("sound_dt")
+    monkeypatch.setattr(module, "SOUND", (100.0,))
+    monkeypatch.setattr(module, "COURANT", (0.2, 0.4, 1.4, 4.0))
+    return module
+
+
+@pytest.mark.physics
+def test_a_map_of_sph_shows_both_sides_of_the_limit(small_sound_map):
+    cells = small_sound_map.run()
+    assert not wrong(cells)
+    fixed = [cell.numbers for cell in cells if "courant" in cell.numbers]
+    assert [(each["refused"], each["outcome"]) for each in fixed] == [(False, "bounded")] * 2 + [(True, "not finite")] * 2
+
+
+@pytest.mark.physics
+def test_a_limit_of_sph_that_is_too_wide_is_found_wrong(small_sound_map, monkeypatch):
+    limits = SPHSimulator.limits
+    monkeypatch.setattr(SPHSimulator, "limits", lambda self, *given: {name: 10 * bound for name, bound in limits(self, *given).items()})
+    assert [cell.right for cell in small_sound_map.run()] == [True, True, False, False, True], "the adaptive run finds its limit in the kernel"
+
+
+@pytest.mark.physics
+def test_a_solve_that_fails_in_silence_is_found_wrong(monkeypatch):
+    module, frame = case("unsolved"), SPHSimulator.frame
+
+    def blind(self):
+        self.unguarded_step = self._scene.time_step
+        try:
+            return frame(self)
+        finally:
+            self.unguarded_step = None
+
+    monkeypatch.setattr(module, "VISCOSITY", ())
+    assert not wrong(module.run())
+    monkeypatch.setattr(SPHSimulator, "frame", blind)
+    assert [cell.cell for cell in module.run() if not cell.right] == ["one iteration, fixed steps", "one iteration, fixed steps, 3D"]
+
+
 def test_a_refusal_that_is_missing_is_found_wrong(monkeypatch):
-    monkeypatch.setattr(MPMSimulator, "check_time_step", lambda *_: None)
+    for solver in (MPMSimulator, SPHSimulator):
+        monkeypatch.setattr(solver, "check_time_step", lambda *_: None)
     monkeypatch.setattr("sim.generate.generate", lambda *_, **__: {"splits": {"train": {
         "ok": 2, "trajectories": 2, "failed": [], "cost": {"wall_seconds": 0.0, "compile_seconds": 0.0}}}})
-    assert not any(cell.right for cell in case("refusal").run())
+    assert [cell.cell for cell in case("refusal").run() if cell.right] == ["dfsph, radius below the spacing"], "whose reason is another one"
 
 
 @pytest.mark.physics
@@ -82,6 +125,7 @@ def test_sand_beyond_the_largest_courant_number_is_found_wrong(monkeypatch):
     """What the matrix found: at a Courant number of 2.8 sand gained energy, and nothing said so."""
     module = case("courant")
     monkeypatch.setattr(module, "MATERIALS", {"sand": module.MATERIALS["sand"]})
+    monkeypatch.setattr(module, "SPH", {})
     monkeypatch.setattr(module, "COURANT", (0.4, 4.0))
     monkeypatch.setattr(module, "COURANT_3D", ())
     assert not wrong(module.run())
