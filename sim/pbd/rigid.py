@@ -112,7 +112,7 @@ class Bodies:
         R, n = rotation(self.turn[b]), ti.cast(last - first, ti.f64)
         mean, A = ti.Vector.zero(ti.f64, 3), ti.Matrix.zero(ti.f64, 3, 3)
         for p in range(first, last):
-            d = self.displaced(b, p, R)
+            d = self.displaced(p)
             mean += d
             A += d.outer_product(self.rest[p])
         mean /= n
@@ -136,12 +136,12 @@ class Bodies:
         self.put(b)
 
     @ti.func
-    def displaced(self, b, p, R):
-        """How far a particle is from its place in the body."""
-        at, x, d = self.centre[b] + R @ self.rest[p], self.base.x[self.base.slot[p]], ti.Vector.zero(ti.f64, 3)
+    def displaced(self, p):
+        """A particle's displacement, which is thereby taken."""
+        i, d = self.base.slot[p], ti.Vector.zero(ti.f64, 3)
         for a in ti.static(range(self.dim)):
-            # Of the rounded place: an undisturbed body stays where it is.
-            d[a] = ti.cast(x[a] - ti.cast(at[a], ti.f32), ti.f64)
+            d[a] = ti.cast(self.base.shift[i][a], ti.f64)
+            self.base.shift[i][a] = 0.0
         return d
 
     @ti.func
@@ -154,29 +154,37 @@ class Bodies:
 
     @ti.func
     def hold(self, b):
-        """The least motion that takes all corners off the walls: u = sum J n / N, turn = I^-1 sum J a x n, J >= 0."""
-        deepest, rounds = self.deepest(b), 0
+        """The least motion that takes all corners off the walls, in rounds; what is left of a penetration is shifted away.
+
+        Centre and rotation are locals: read again from their fields within the loop, they were those of its start.
+        """
+        centre, q = self.centre[b], self.turn[b]
         spacing = ti.cast(self.base.number[self.base.SPACING], ti.f64)
-        while deepest > 1e-6 * spacing and rounds < ROUNDS:
-            self.lift_off(b, spacing)
-            deepest = self.deepest(b)
+        low, high = self.depths(b, centre, rotation(q))
+        rounds = 0
+        while (low + high).norm() > 1e-6 * spacing and rounds < ROUNDS:
+            u, phi = self.lift_off(b, centre, rotation(q), spacing)
+            centre += u
+            q = turned(q, phi)
+            low, high = self.depths(b, centre, rotation(q))
             rounds += 1
-        if deepest > 0.0:
-            self.shift(b)
+        self.centre[b], self.turn[b] = centre + low - high, q
 
     @ti.func
-    def deepest(self, b):
-        R, deep = rotation(self.turn[b]), ti.cast(0.0, ti.f64)
+    def depths(self, b, centre, R):
+        """How deep the deepest corners stand in the lower and in the upper walls, [3] each."""
+        low, high = ti.Vector.zero(ti.f64, 3), ti.Vector.zero(ti.f64, 3)
         for p in range(self.span[b][0], self.span[b][1]):
             if self.corner[p]:
-                at = self.centre[b] + R @ self.rest[p]
-                for f in range(2 * self.dim):
-                    deep = ti.max(deep, -self.gap(at, f))
-        return deep
+                at = centre + R @ self.rest[p]
+                for d in ti.static(range(self.dim)):
+                    low[d], high[d] = ti.max(low[d], -self.gap(at, 2 * d)), ti.max(high[d], -self.gap(at, 2 * d + 1))
+        return low, high
 
     @ti.func
-    def lift_off(self, b, spacing):
-        R, first, last = rotation(self.turn[b]), self.span[b][0], self.span[b][1]
+    def lift_off(self, b, centre, R, spacing):
+        """u = sum J n / N and phi = I^-1 sum J a x n that take the corners at c + a off the walls, J >= 0."""
+        first, last = self.span[b][0], self.span[b][1]
         W, mass = R @ self.inverse[b] @ R.transpose(), ti.cast(last - first, ti.f64)
         u, phi = ti.Vector.zero(ti.f64, 3), ti.Vector.zero(ti.f64, 3)
         for p in range(first, last):
@@ -189,34 +197,21 @@ class Bodies:
                 if self.corner[p]:
                     arm = R @ self.rest[p]
                     for f in range(2 * self.dim):
-                        gap = self.gap(self.centre[b] + arm, f)
+                        gap = self.gap(centre + arm, f)
                         if gap < NEAR * spacing:
                             n = ti.Vector.zero(ti.f64, 3)
                             n[f // 2] = 1.0 - 2.0 * (f % 2)
                             lever = arm.cross(n)
                             away = W @ lever
-                            softness = 1.0 / mass + lever.dot(away)
                             moved = u + phi.cross(arm)
                             before = self.push[p][f]
-                            now = ti.max(before - (gap + moved.dot(n)) / softness, 0.0)
+                            now = ti.max(before - (gap + moved.dot(n)) / (1.0 / mass + lever.dot(away)), 0.0)
                             self.push[p][f] = now
                             u += (now - before) / mass * n
                             phi += (now - before) * away
                             change = ti.max(change, ti.abs(now - before))
                             largest = ti.max(largest, now)
-        self.centre[b] += u
-        self.turn[b] = turned(self.turn[b], phi)
-
-    @ti.func
-    def shift(self, b):
-        """By what the corners still stand in walls."""
-        R, low, high = rotation(self.turn[b]), ti.Vector.zero(ti.f64, 3), ti.Vector.zero(ti.f64, 3)
-        for p in range(self.span[b][0], self.span[b][1]):
-            if self.corner[p]:
-                at = self.centre[b] + R @ self.rest[p]
-                for d in ti.static(range(self.dim)):
-                    low[d], high[d] = ti.max(low[d], -self.gap(at, 2 * d)), ti.max(high[d], -self.gap(at, 2 * d + 1))
-        self.centre[b] += low - high
+        return u, phi
 
     @ti.func
     def conclude(self, b, dt):

@@ -88,9 +88,9 @@ class _Kernels:
         self.extent = ti.Vector.field(4, ti.f32, 2)
         self.table = ti.Vector.field(6, ti.f32, ENTRIES + 2)
         self.x, self.v = (ti.Vector.field(4, ti.f32, capacity) for _ in range(2))  # v[3]: w
-        self.ahead = ti.Vector.field(4, ti.f32, capacity)  # where it would fly; lane 3: k
+        self.shift = ti.Vector.field(4, ti.f32, capacity)  # displacement in the step, of bodies' particles in an iteration; lane 3: k
         self.id, self.body = (ti.field(ti.i32, capacity) for _ in range(2))  # body -1: water
-        self.state, self.labels = [self.x, self.v, self.ahead], [self.id, self.body]
+        self.state, self.labels = [self.x, self.v, self.shift], [self.id, self.body]
         self.moved = [ti.Vector.field(4, ti.f32, capacity) for _ in range(3)]
         self.moved_labels = [ti.field(ti.i32, capacity) for _ in range(2)]
         self.gradient = ti.Vector.field(4, ti.f32, pairs)  # G_ij; lane 3: V W
@@ -122,11 +122,13 @@ class _Kernels:
 
     @ti.func
     def enclose(self, i):
-        x = self.x[i]
+        """Keep a particle inside the walls, as a displacement."""
         for d in ti.static(range(self.dim)):
-            if finite(x[d]):
-                x[d] = ti.min(ti.max(x[d], self.extent[0][d] + HAIR), self.extent[1][d] - HAIR)
-        self.x[i] = x
+            x = self.x[i][d]
+            inside = ti.min(ti.max(x, self.extent[0][d] + HAIR), self.extent[1][d] - HAIR)
+            if finite(x) and x != inside:
+                self.x[i][d] = inside
+                self.shift[i][d] += inside - x
 
     # -- pairs
     @ti.func
@@ -200,11 +202,11 @@ class _Kernels:
         """dk of an iteration into ``sums``, k changed by it; returns the mean residual. ``warm``: dk is the k of the step before, k stays."""
         error = 0.0
         for i in range(n):
-            C, before = self.wall[i][3] - 1.0, self.ahead[i][3]
+            C, before = self.wall[i][3] - 1.0, self.shift[i][3]
             error += ti.select(before > 0.0, ti.abs(C), ti.max(C, 0.0))
             now = ti.max(before + RELAXATION * C / self.sums[i][3], 0.0)
             self.sums[i][3] = ti.select(warm, before, now - before)
-            self.ahead[i][3] = ti.select(warm, before, now)
+            self.shift[i][3] = ti.select(warm, before, now)
         return error / ti.cast(n, ti.f32)
 
     @ti.func
@@ -244,8 +246,12 @@ class _Kernels:
         """x -= w drift; bodies as a whole; all off the walls."""
         for i in range(n):
             for d in ti.static(range(self.dim)):
-                self.x[i][d] -= self.v[i][3] * self.drift[i][d]
-            self.enclose(i)
+                move = self.v[i][3] * self.drift[i][d]
+                # Summed up by itself: as a difference of places it would be rounded like them, and momentum with it.
+                self.shift[i][d] -= move
+                self.x[i][d] -= move
+            if self.body[i] < 0:
+                self.enclose(i)
         if ti.static(self.structure.bodies > 0):
             for b in range(self.bodies.count[None]):
                 self.bodies.match(b)
@@ -289,16 +295,14 @@ class _Kernels:
         """``last``: length of the step before, 0 at the start."""
         kick, ratio = 0.5 * (last + dt) * g, ti.select(last > 0.0, dt / ti.max(last, 1e-12), 0.0)
         for i in range(n):
+            # Multipliers are impulses times dt.
+            self.shift[i] = ti.Vector([0.0, 0.0, 0.0, WARM * ratio * ratio * self.shift[i][3]])
             if self.body[i] < 0:
                 self.v[i] += kick
                 move = dt * self.v[i]
                 move[3] = 0.0
                 self.x[i] += move
-            k = WARM * ratio * ratio * self.ahead[i][3]
-            self.ahead[i] = self.x[i]
-            # Multipliers are impulses times dt.
-            self.ahead[i][3] = k
-            self.enclose(i)
+                self.enclose(i)
         if ti.static(self.structure.bodies > 0):
             for b in range(self.bodies.count[None]):
                 self.bodies.fly(b, ti.cast(dt, ti.f64), ti.cast(ti.Vector([kick[0], kick[1], kick[2]]), ti.f64))
@@ -326,7 +330,7 @@ class _Kernels:
         for i in range(n):
             if self.body[i] < 0:
                 for d in ti.static(range(self.dim)):
-                    self.v[i][d] += (self.x[i][d] - self.ahead[i][d]) / dt
+                    self.v[i][d] += self.shift[i][d] / dt
         if ti.static(self.structure.xsph):
             self.smooth(n)
         if ti.static(self.structure.bodies > 0):
@@ -523,7 +527,7 @@ class PBDSimulator:
         structure, (_, support, cells), dim = self._structure(scene), self._layout(scene), scene.dim
         particles = scene.particles(self._refine(scene))
         n, boxes, pairs = self._sizes(scene, len(particles.position))
-        state = {"x": 16, "v": 16, "ahead": 16, "id": 4, "body": 4}
+        state = {"x": 16, "v": 16, "shift": 16, "id": 4, "body": 4}
         fields = {f"{kept}{name}": (size, n) for kept in ("", "moved ") for name, size in state.items()}
         fields |= {"sums": (16, n), "wall": (16, n), "drift": (16, n), "cell": (4, n), "sorted place": (4, n), "first pair": (4, n + 1),
                    "place when listed": (16, n), "pairs": (4, pairs), "gradients": (16, pairs), "first of a cell": (4, boxes + 2),
@@ -639,13 +643,11 @@ class PBDSimulator:
 
     def state(self) -> dict[str, np.ndarray]:
         """All simulated particles in the order of the scene, float64: ``position`` [length], ``velocity`` [length / s] (half a step ago), [n, dim] each,
-        ``density`` over that at rest, ``pressure`` [Pa], [n] each."""
+        ``density`` over that at rest [n]."""
         kernels, n, dim, h = self._kernels, *self._position.shape, self._support
         order = np.argsort(kernels.id.to_numpy()[:n])
-        x, v, ahead = (field.to_numpy()[:n][order].astype(float) for field in kernels.state)
-        pressure = ahead[:, 3] * self._density(self._scene) * h**2 / self._last**2 if self._last else np.zeros(n)
-        return {"position": self._lower + x[:, :dim] * h, "velocity": v[:, :dim] * h,
-                "density": kernels.wall.to_numpy()[:n, 3][order].astype(float), "pressure": pressure}  # fmt: skip
+        x, v, wall = (field.to_numpy()[:n][order].astype(float) for field in (kernels.x, kernels.v, kernels.wall))
+        return {"position": self._lower + x[:, :dim] * h, "velocity": v[:, :dim] * h, "density": wall[:, 3]}
 
     def set_velocity(self, velocity: np.ndarray) -> None:
         """Replace the velocities [n, dim] of all particles; bodies take the rigid motion nearest to theirs. For starts that no scene describes."""
