@@ -24,6 +24,10 @@ from sim.taichi_runtime import ti
 #: Particles count as inside the fluid where sum_j V r . grad W exceeds this share of the dimension (Lee et al. 2008: 1.5 of 2).
 INSIDE = 0.75
 
+#: Viscosity times the step, at most. Roughness of the lattice's own wavelength decays at 42 to 50 times the viscosity, beside a sticky wall at 35 to 40
+#: more (its ``DRAG`` at ``CLOSEST``), and the scheme is stable while that rate times the step is below 1.
+VISCOUS = 0.01
+
 
 @ti.data_oriented
 class WCSPH:
@@ -166,7 +170,7 @@ class WCSPH:
         c = base.number[base.SOUND] * ti.pow(dense, 0.5 * (base.number[base.GAMMA] - 1.0))
         dt = base.number[base.CFL] * base.number[base.SPACING] / (c + fast)
         dt = ti.min(dt, 0.25 * ti.sqrt(0.5 / ti.max(strong, 1e-12)))
-        return ti.min(dt, 0.125 * 0.25 / ti.max(base.number[base.VISCOSITY], 1e-12)), fast
+        return ti.min(dt, VISCOUS / ti.max(base.number[base.VISCOSITY], 1e-12)), fast
 
     @ti.func
     def step(self, n, dt, g, report: ti.template()):
