@@ -26,9 +26,10 @@ from sim.taichi_runtime import ti
 
 #: Particles count as inside the fluid where sum_j V r . grad W exceeds this share of the dimension (Lee et al. 2008: 1.5 of 2).
 INSIDE = 0.75
-#: Largest c dt / h, whatever Courant number is asked for, and largest nu dt / h^2 (h = 1/2). On a lattice the fastest sound has w = 1.2 c / h, and
-#: the fastest decay by viscosity, which a predicted velocity bears up to a rate of 1 / dt, 12 nu / h^2 (``sim.stability``: sound_dt, viscosity_dt).
-LARGEST_COURANT, LARGEST_VISCOUS = 0.5, 1 / 16
+#: Largest c dt / h, whatever Courant number is asked for, and largest nu dt / h^2 (h = 1/2). On a lattice the fastest sound has w = 1.2 c / h;
+#: roughness of the lattice's own wavelength decays at 42 to 50 nu per support radius squared, beside a sticky wall at 35 to 40 more (its ``DRAG`` at
+#: ``CLOSEST``), which a predicted velocity bears up to a rate of 1 / dt (``sim.stability``: sound_dt, viscosity_dt).
+LARGEST_COURANT, LARGEST_VISCOUS = 0.5, 1 / 25
 
 
 @ti.data_oriented

@@ -8,12 +8,13 @@ from sim.sph.solver import SPHSimulator
 from sim.validation import Curve, Outcome, scene, timed
 
 NUMBER = 12
+METHODS = ("dfsph",)
 #: Particles along the column of water, which is as high as wide and a third of the tank's width.
 RESOLUTIONS = (20, 40, 80)
 L, G, SECONDS = 0.4, 9.81, 10.0
 
 
-def run(resolution: int) -> Outcome:
+def run(resolution: int, method: str) -> Outcome:
     """A column of water, 0.4 by 0.4, in a tank 1.2 wide and 1 high, by DFSPH at its default tolerances.
 
     volume: where the kernels of particles and walls sum up to more than 1/2, sampled at a quarter of the spacing once a second. Particles at the
@@ -22,7 +23,7 @@ def run(resolution: int) -> Outcome:
     """
     what = scene(
         "sloshing", {"model": "water"}, [{"kind": "box", "lower": [0.0, 0.0], "upper": [L, L]}], [[0.0, 3 * L], [0.0, 1.0]],
-        [3 * resolution, round(1.0 / L * resolution)], 0.01, gravity=[0.0, -G], particles_per_cell=1, solver={"method": "dfsph"},
+        [3 * resolution, round(1.0 / L * resolution)], 0.01, gravity=[0.0, -G], particles_per_cell=1, solver={"method": method},
     )  # fmt: skip
     solver = SPHSimulator()
     solver.load(what)

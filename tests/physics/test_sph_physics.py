@@ -78,3 +78,16 @@ def test_a_throw_is_a_parabola_from_its_first_step(method):
     ahead = -g * solver.diagnostics()["dt"] * t / 2 if method == "dfsph" else 0.0
     np.testing.assert_allclose(moved.mean(0), [t, 2 * t - g * t**2 / 2 + ahead], atol=1e-5)
     assert np.ptp(moved, axis=0).max() < 0.01 * what.spacing
+
+
+@pytest.mark.physics
+def test_viscosity_limits_the_step():
+    """Between sticky walls thick water that moves along them does nothing else; with steps twice as long as they may be it boiled."""
+    what = scene("thick", {"model": "water", "sound_speed": 20.0, "density": 1.0, "viscosity": 1.0},
+                 [{"kind": "box", "lower": [0.0, 0.0], "upper": [1.0, 1.0]}], [[0.0, 1.0]] * 2, [15] * 2, 0.05, periodic=["x"],
+                 walls={"friction": "sticky"}, gravity=[10.0, 0.0], solver={"method": "wcsph"})  # fmt: skip
+    solver = SPHSimulator()
+    solver.load(what)
+    solver.frame()
+    along, across = solver.state()["velocity"].T
+    assert 0.3 < along.max() < 1.25 and np.abs(across).max() < 0.01
