@@ -342,6 +342,9 @@ class DFSPH:
             u[3] = 0.0
             fast = ti.max(fast, u.norm_sqr())
             total += self.pressure[i][1]
+        if ti.static(self.structure.no_slip):
+            for f in ti.static(range(base.faces)):
+                fast = ti.max(fast, base.slide[f].norm_sqr())
         deep = 0.0
         for d in ti.static(range(self.dim)):
             deep += ti.abs(g[d]) * (base.extent[1][d] - base.extent[0][d])

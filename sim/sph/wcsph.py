@@ -24,8 +24,8 @@ from sim.taichi_runtime import ti
 #: Particles count as inside the fluid where sum_j V r . grad W exceeds this share of the dimension (Lee et al. 2008: 1.5 of 2).
 INSIDE = 0.75
 
-#: Viscosity times the step, at most. Roughness of the lattice's own wavelength decays at 42 to 50 times the viscosity, beside a sticky wall at 35 to 40
-#: more (its ``DRAG`` at ``CLOSEST``), and the scheme is stable while that rate times the step is below 1.
+#: Viscosity times the step, at most. Roughness of the lattice's own wavelength decays at 42 to 50 times the viscosity, beside a sticky wall at 35
+#: to 40 more (its ``DRAG`` at ``CLOSEST``), and the scheme is stable while that rate times the step is below 1.
 VISCOUS = 0.01
 
 
@@ -178,15 +178,7 @@ class WCSPH:
         base = self.base
         shift = 0.0
         if ti.static(self.structure.shifting):
-            mean = ti.Vector.zero(ti.f64, 4)
-            for i in range(n):
-                mean += ti.cast(base.v[i], ti.f64)
-            drift = ti.cast(mean / n, ti.f32)
-            for i in range(n):
-                u = base.v[i] - drift
-                u[3] = 0.0
-                shift = ti.max(shift, u.norm_sqr())
-            shift = 2.0 * dt * ti.sqrt(shift)
+            shift = 2.0 * dt * base.stir(n)
         for i in range(n):
             a = self.rate[i]
             self.before[i] = a
