@@ -344,6 +344,9 @@ class DFSPH:
             fast = ti.max(fast, u.norm_sqr())
             total += self.pressure[i][1]
             every += u.norm_sqr()
+        if ti.static(self.structure.no_slip):
+            for f in ti.static(range(base.faces)):
+                fast = ti.max(fast, base.slide[f].norm_sqr())
         deep = 0.0
         for d in ti.static(range(self.dim)):
             deep += ti.abs(g[d]) * (base.extent[1][d] - base.extent[0][d])

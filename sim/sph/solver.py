@@ -190,6 +190,19 @@ class _Kernels:
                     x[d] = ti.min(ti.max(x[d] + (HAIR - s) * n[d], self.extent[0][d] + HAIR), self.extent[1][d] - HAIR)
         self.x[i] = x
 
+    @ti.func
+    def stir(self, n):
+        """Largest speed beyond the mean velocity: that of shifting, so that water in free flight is not shifted."""
+        mean, fast = ti.Vector.zero(ti.f64, 4), 0.0
+        for i in range(n):
+            mean += ti.cast(self.v[i], ti.f64)
+        drift = ti.cast(mean / n, ti.f32)
+        for i in range(n):
+            u = self.v[i] - drift
+            u[3] = 0.0
+            fast = ti.max(fast, u.norm_sqr())
+        return ti.sqrt(fast)
+
     # -- pairs
     @ti.func
     def list_pairs(self, n, report: ti.template()):

@@ -190,15 +190,7 @@ class WCSPH:
         base = self.base
         shift = 0.0
         if ti.static(self.structure.shifting):
-            mean = ti.Vector.zero(ti.f64, 4)
-            for i in range(n):
-                mean += ti.cast(base.v[i], ti.f64)
-            drift = ti.cast(mean / n, ti.f32)
-            for i in range(n):
-                u = base.v[i] - drift
-                u[3] = 0.0
-                shift = ti.max(shift, u.norm_sqr())
-            shift = 2.0 * dt * ti.sqrt(shift)
+            shift = 2.0 * dt * base.stir(n)
         for i in range(n):
             a = self.rate[i]
             # What the rate of the density will be, if it changes on as it did.
