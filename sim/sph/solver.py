@@ -434,7 +434,7 @@ class SPHSimulator:
     def limits(self, scene: Scene, speed: float) -> dict[str, float]:
         """Bounds on the time step [s] at a speed of particles [m/s], by what sets them (h: half the support radius).
 
-        WCSPH: cfl spacing / (c + |v|), h / (2 c), h^2 / (16 nu), sqrt(h / |g|) / 4 (Monaghan 1992). DFSPH: (|v| + sqrt(|g| H)) dt + |g| dt^2 = cfl
+        WCSPH: cfl spacing / (c + |v|), h / (2 c), h^2 / (25 nu), sqrt(h / |g|) / 4 (Monaghan 1992). DFSPH: (|v| + sqrt(|g| H)) dt + |g| dt^2 = cfl
         spacing, H: height of the highest body.
         """
         spacing, support, _ = self._layout(scene)

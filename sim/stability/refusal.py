@@ -31,7 +31,7 @@ BINDING = {
 BINDING_SPH = {
     ("wcsph", "the Courant number"): ({"model": "water", "sound_speed": 20.0}, 0.4, 5.0, 0.4 * 0.5 / CELLS / 25.0),
     ("wcsph", "the speed of sound"): ({"model": "water", "sound_speed": 20.0}, 2.0, 0.0, 0.5 * H / 20.0),
-    ("wcsph", "the viscosity"): ({"model": "water", "sound_speed": 5.0, "viscosity": 2000.0}, 0.4, 0.0, H**2 / 16 / 2.0),
+    ("wcsph", "the viscosity"): ({"model": "water", "sound_speed": 5.0, "viscosity": 2000.0}, 0.4, 0.0, H**2 / 25 / 2.0),
     ("dfsph", "the Courant number"): ({"model": "water"}, 0.4, 5.0, 0.4 * 0.5 / CELLS / 5.0),
 }
 

@@ -25,7 +25,7 @@ MAPS = {
     "young_dt": ("young_modulus", "Young's modulus E [Pa]", "0.4 dx / (c + v)", "dx / (c + v)"),
     "speed_dt": ("speed", "speed v [m/s]", "0.4 dx / (c + v)", "dx / (c + v)"),
     "sound_dt": ("sound_speed", "speed of sound c [m/s]", "0.4 d / c", "d / c"),
-    "viscosity_dt": ("viscosity", "kinematic viscosity [m2/s]", "h^2 / (16 nu)", "h^2 / nu"),
+    "viscosity_dt": ("viscosity", "kinematic viscosity [m2/s]", "h^2 / (25 nu)", "h^2 / nu"),
     "fall_dt": ("speed", "speed v [m/s]", "(v + sqrt(g H)) dt + g dt^2 = 0.4 d", "= d"),
 }
 
