@@ -291,9 +291,28 @@ class _Kernels:
         return 2.0 * way / ti.max(fast + ti.sqrt(fast * fast + 4.0 * pull * way), 1e-12), fast
 
     @ti.func
+    def moisten(self, n):
+        """drift[3] of a body's particles: sum of k V W over those of water near it."""
+        for i in range(n):
+            self.drift[i][3] = 0.0
+        for i in range(n):
+            for k in range(self.neighbours.first[i], self.neighbours.first[i + 1]):
+                j = self.neighbours.other[k]
+                if self.body[i] >= 0 and self.body[j] < 0:
+                    self.drift[i][3] += self.shift[j][3] * self.gradient[k][3]
+                if self.body[j] >= 0 and self.body[i] < 0:
+                    self.drift[j][3] += self.shift[i][3] * self.gradient[k][3]
+
+    @ti.func
     def step(self, n, dt, last, g, report: ti.template()):
         """``last``: length of the step before, 0 at the start."""
         kick, ratio = 0.5 * (last + dt) * g, ti.select(last > 0.0, dt / ti.max(last, 1e-12), 0.0)
+        if ti.static(self.structure.bodies > 0):
+            if last > 0.0:
+                self.moisten(n)
+                for b in range(self.bodies.count[None]):
+                    for f in range(2 * self.dim):
+                        self.bodies.lubricate(b, f, self.drift, dt / (last * last))
         for i in range(n):
             # Multipliers are impulses times dt.
             self.shift[i] = ti.Vector([0.0, 0.0, 0.0, WARM * ratio * ratio * self.shift[i][3]])
@@ -414,7 +433,7 @@ class _Kernels:
                 self.bodies.count[None] = bodies.shape[0]
                 for i in range(n):
                     self.bodies.rest[i] = ti.Vector([places[i, 0], places[i, 1], places[i, 2]])
-                    self.bodies.corner[i] = ti.cast(places[i, 3], ti.i32)
+                    self.bodies.corner[i], self.bodies.own[i] = ti.cast(places[i, 3], ti.i32), ti.cast(places[i, 4], ti.f32)
                 for b in range(bodies.shape[0]):
                     self.bodies.span[b] = ti.Vector([ti.cast(bodies[b, 0], ti.i32), ti.cast(bodies[b, 1], ti.i32)])
                     self.bodies.centre[b] = ti.Vector([bodies[b, 2], bodies[b, 3], bodies[b, 4]])
