@@ -8,9 +8,9 @@ would fly, exactly; constraints then displace its particles by d, and the body t
 where the last term is what particles, cubes of edge s that turn along, add (Muller & Chentanez 2011): the moment of inertia is that of the cubes.
 Linear momentum is kept exactly, angular momentum to first order in d. The rotation is found from R0 on (Muller, Bender, Chentanez & Macklin 2016).
 
-Decision: velocities are those of the *body*, V += (c - c before the constraints) / dt, and so the angular momentum (Muller et al. 2020), instead of each
-particle's (x - x before) / dt (Macklin et al. 2014). The latter are chords of a turning body: its spin w would decay by (w dt)^2 a step, a fifth
-in a second at 5 rad/s and 120 steps a second.
+Decision: velocities are those of the *body*, V += (c - c before the constraints) / dt, and so the angular momentum (Muller et al. 2020), instead of
+each particle's (x - x before) / dt (Macklin et al. 2014). The latter are chords of a turning body: its spin w would decay by (w dt)^2 a step, a
+fifth in a second at 5 rad/s and 120 steps a second.
 
 Walls hold the body at its corners, the hull of its particles, each a ball half a spacing thick. Their pushes J >= 0 are found together (projected
 Gauss-Seidel), lest a cube that lands flat be tilted by the order of its corners. Contacts are inelastic and slip.
@@ -79,7 +79,8 @@ class Bodies:
         fields = {"span": 8, "centre": 24, "velocity": 24, "momentum": 24, "turn": 32, "inertia": 72, "inverse inertia": 72, "centre ahead": 24,
                   "turn ahead": 32}  # fmt: skip
         own = {"rest place": 24, "corner": 4, "own density": 4, "push": 48}
-        return {f"rigid {name}": (size, capacity) for name, size in fields.items()} | {f"rigid {name}": (size, particles) for name, size in own.items()}
+        found = {name: (size, capacity) for name, size in fields.items()} | {name: (size, particles) for name, size in own.items()}
+        return {f"rigid {name}": entry for name, entry in found.items()}
 
     @ti.func
     def put(self, b):
@@ -98,11 +99,11 @@ class Bodies:
 
     @ti.func
     def lubricate(self, b, f, wet: ti.template(), pull):
-        """The pressure of the film of water between a body and wall f, as a change of its velocity and momentum; ``pull``: dt over the step before's dt^2.
+        """The pressure of the film of water between a body and wall f, as a change of its velocity and momentum; ``pull``: dt / (step before)^2.
 
-        A layer of particles needs a gap of a whole spacing; real water is under the body long before. Its pressure is taken to be that of the water
-        around the gap: the mean of k over the share of the kernel that particles that face the wall leave to water, dry parts counting as none. Without
-        it a light cube that had touched the floor stayed there, held down by what stands on it.
+        A layer of particles needs a gap of a whole spacing; real water is under the body long before. Its pressure is taken to be that of the
+        water around the gap: the mean of k over the share of the kernel that particles which face the wall leave to water, dry parts counting as
+        none. Without it a light cube that had touched the floor stayed there, held down by what stands on it.
         """
         spacing, axis, side = self.base.number[self.base.SPACING], f // 2, 1.0 - 2.0 * (f % 2)
         row = ti.cast(0.5 * spacing * float(ENTRIES), ti.i32)
