@@ -221,8 +221,8 @@ class PositionBased(_Strict):
 
     support [particle spacings]; substeps of a frame at least (FleX takes two); density_error: mean error, relative density, at which a solve ends;
     iterations of a solve at most; xsph: share of the neighbours' mean velocity that a particle takes on in every step (0.01 as published);
-    tensile: strength of s_corr, which parts pairs that are closer than the spacing: at 0.01 the closest of water at rest are 0.89 of it apart instead of
-    0.77, above 0.02 it does not come to rest."""
+    tensile: strength of s_corr, which parts pairs that are closer than the spacing: at 0.01 the closest of water at rest are 0.89 of it apart instead
+    of 0.77, above 0.02 it does not come to rest."""
 
     method: Literal["pbf"]
     support: _Support = 2.0
@@ -365,16 +365,19 @@ class _Physics(_Strict):
             key = "friction" if self.walls.friction != 0 else "velocity"
             raise _mistake(f"walls.{key}", getattr(self.walls, key), "position-based walls slip and stand still; leave it out")
         if obstacles := getattr(self, "obstacles", []):
-            raise _mistake("obstacles", [obstacle.kind for obstacle in obstacles], "position-based scenes have none; choose solver.method dfsph or leave it out")
+            kinds = [obstacle.kind for obstacle in obstacles]
+            raise _mistake("obstacles", kinds, "position-based scenes have none; leave it out or choose solver.method dfsph")
         waters = [name for name, material in self.materials.items() if material.model == "water"]
         for name, material in self.materials.items():
             where = f"materials.{name}"
             if material.model not in ("water", "rigid"):
-                raise _mistake(f"{where}.model", material.model, "position-based scenes hold water and rigid bodies; MPM (leave solver out) all materials")
+                remedy = "position-based scenes hold water and rigid bodies; MPM (leave solver out) all materials"
+                raise _mistake(f"{where}.model", material.model, remedy)
             if name in waters[1:]:
                 raise _mistake(f"{where}.model", "water", f"position-based scenes hold one kind of water, here {waters[0]}; leave one out")
             if getattr(material, "viscosity", 0):
-                raise _mistake(f"{where}.viscosity", material.viscosity, "position-based water has none but solver.xsph; use 0, or solver.method dfsph")
+                remedy = "position-based water has none but solver.xsph; use 0, or solver.method dfsph"
+                raise _mistake(f"{where}.viscosity", material.viscosity, remedy)
 
 
 class _FamilyModel(_Physics):
@@ -791,7 +794,7 @@ def explain_validation(error: ValidationError, where: object) -> InputError:
     path, value, location = "", first["input"], first["loc"]
     for place, part in enumerate(location):
         # pydantic names the branch of a union after the key; that is not a key of the file.
-        tagged = place > 0 and (location[place - 1] == "shape" or (place == 2 and location[0] in ("materials", "obstacles")))
+        tagged = place > 0 and (location[place - 1] in ("shape", "solver") or (place == 2 and location[0] in ("materials", "obstacles")))
         branch = tagged or (place > 0 and (str(part) in ("float", "str", "constrained-float") or "[" in str(part)))
         if isinstance(part, int):
             path += f"[{part}]"

@@ -8,9 +8,9 @@ would fly, exactly; constraints then displace its particles by d, and the body t
 where the last term is what particles, cubes of edge s that turn along, add (Muller & Chentanez 2011): the moment of inertia is that of the cubes.
 Linear momentum is kept exactly, angular momentum to first order in d. The rotation is found from R0 on (Muller, Bender, Chentanez & Macklin 2016).
 
-Decision: velocities are those of the *body*, V += (c - c before the constraints) / dt, and so the angular momentum (Muller et al. 2020), instead of each
-particle's (x - x before) / dt (Macklin et al. 2014). The latter are chords of a turning body: its spin w would decay by (w dt)^2 a step, a fifth
-in a second at 5 rad/s and 120 steps a second.
+Decision: velocities are those of the *body*, V += (c - c before the constraints) / dt, and so the angular momentum (Muller et al. 2020), instead of
+each particle's (x - x before) / dt (Macklin et al. 2014). The latter are chords of a turning body: its spin w would decay by (w dt)^2 a step, a
+fifth in a second at 5 rad/s and 120 steps a second.
 
 Walls hold the body at its corners, the hull of its particles, each a ball half a spacing thick. Their pushes J >= 0 are found together (projected
 Gauss-Seidel), lest a cube that lands flat be tilted by the order of its corners. Contacts are inelastic and slip.
@@ -23,6 +23,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from sim.mpm.rigid import rotation, turned
 from sim.scene import Particles, Scene
+from sim.sph.kernel import ENTRIES, SHARE, SLOPE, kernel, lattice_scale
 from sim.taichi_runtime import ti
 
 #: Iterations of the rotation at most, and the angle at which it is found.
@@ -65,7 +66,7 @@ class Bodies:
         self.count = ti.field(ti.i32, ())
         self.span = ti.Vector.field(2, ti.i32, capacity)  # of the scene's particles
         self.rest = ti.Vector.field(3, ti.f64, particles)
-        self.corner = ti.field(ti.i32, particles)
+        self.corner, self.own = ti.field(ti.i32, particles), ti.field(ti.f32, particles)
         self.push = ti.Vector.field(6, ti.f64, particles)
         self.centre, self.velocity, self.momentum = (ti.Vector.field(3, ti.f64, capacity) for _ in range(3))
         self.turn = ti.Vector.field(4, ti.f64, capacity)
@@ -77,8 +78,9 @@ class Bodies:
         """Fields as ``plan`` lists them: name -> (bytes an entry, entries)."""
         fields = {"span": 8, "centre": 24, "velocity": 24, "momentum": 24, "turn": 32, "inertia": 72, "inverse inertia": 72, "centre ahead": 24,
                   "turn ahead": 32}  # fmt: skip
-        own = {"rest place": 24, "corner": 4, "push": 48}
-        return {f"rigid {name}": (size, capacity) for name, size in fields.items()} | {f"rigid {name}": (size, particles) for name, size in own.items()}
+        own = {"rest place": 24, "corner": 4, "own density": 4, "push": 48}
+        found = {name: (size, capacity) for name, size in fields.items()} | {name: (size, particles) for name, size in own.items()}
+        return {f"rigid {name}": entry for name, entry in found.items()}
 
     @ti.func
     def put(self, b):
@@ -94,6 +96,41 @@ class Bodies:
         """Spin [3] of a body that stands at q, by its angular momentum."""
         R = rotation(q)
         return R @ (self.inverse[b] @ (R.transpose() @ self.momentum[b]))
+
+    @ti.func
+    def lubricate(self, b, f, wet: ti.template(), pull):
+        """The pressure of the film of water between a body and wall f, as a change of its velocity and momentum; ``pull``: dt / (step before)^2.
+
+        A layer of particles needs a gap of a whole spacing; real water is under the body long before. Its pressure is taken to be that of the
+        water around the gap: the mean of k over the share of the kernel that particles which face the wall leave to water, dry parts counting as
+        none. Without it a light cube that had touched the floor stayed there, held down by what stands on it.
+        """
+        spacing, axis, side = self.base.number[self.base.SPACING], f // 2, 1.0 - 2.0 * (f % 2)
+        row = ti.cast(0.5 * spacing * float(ENTRIES), ti.i32)
+        share, steep = self.base.table[row][SHARE], -self.base.table[row][SLOPE]
+        water, room = 0.0, 0.0
+        for p in range(self.span[b][0], self.span[b][1]):
+            i = self.base.slot[p]
+            if self.wall_distance(self.base.x[i], f) < 1.5 * spacing:
+                water += wet[i][3]
+                room += ti.max(1.0 - share - self.own[p], 0.0)
+        if water > 0.0:
+            k = water / ti.max(room, 1e-6)
+            R, mass = rotation(self.turn[b]), ti.cast(self.span[b][1] - self.span[b][0], ti.f64)
+            for p in range(self.span[b][0], self.span[b][1]):
+                i = self.base.slot[p]
+                if self.wall_distance(self.base.x[i], f) < 1.5 * spacing:
+                    # More than the constraint of the particle itself has pushed already.
+                    more = ti.max(k * steep + side * self.base.shift[i][3] * self.base.wall[i][axis], 0.0)
+                    push = ti.Vector.zero(ti.f64, 3)
+                    push[axis] = ti.cast(pull * self.base.v[i][3] * more * side, ti.f64)
+                    self.velocity[b] += push / mass
+                    self.momentum[b] += (R @ self.rest[p]).cross(push)
+
+    @ti.func
+    def wall_distance(self, x, f):
+        axis = f // 2
+        return ti.select(f % 2 == 0, x[axis] - self.base.extent[0][axis], self.base.extent[1][axis] - x[axis])
 
     @ti.func
     def fly(self, b, dt, kick):
@@ -254,12 +291,13 @@ COLUMNS = 14
 
 
 def body_table(scene: Scene, particles: Particles, position: np.ndarray, edge: float) -> tuple[np.ndarray, np.ndarray]:
-    """[bodies, COLUMNS] float64: span, centre [3], inertia [9]; and [n, 4]: a particle's place in its body, 1 for corners of the hull.
+    """[bodies, COLUMNS] float64: span, centre [3], inertia [9]; and [n, 5]: a particle's place in its body, 1 for corners of the hull, its density
+    by the body alone.
 
     ``position`` [n, dim] and ``edge`` (spacing) in support radii.
     """
     dim, rigid = scene.dim, [index for index, body in enumerate(scene.bodies) if scene.materials[body.material].model == "rigid"]
-    table, places = np.zeros((len(rigid), COLUMNS)), np.zeros((len(position), 4))
+    table, places = np.zeros((len(rigid), COLUMNS)), np.zeros((len(position), 5))
     for row, index in zip(table, rigid, strict=True):
         members = np.flatnonzero(particles.body == index)
         centre = position[members].mean(0)
@@ -267,7 +305,9 @@ def body_table(scene: Scene, particles: Particles, position: np.ndarray, edge: f
         arm[:, :dim] = position[members] - centre
         second = arm.T @ arm + len(members) * edge**2 / 12 * np.diag([1.0] * dim + [0.0] * (3 - dim))
         row[:2], row[2 : 2 + dim], row[5:14] = (members[0], members[-1] + 1), centre, (np.trace(second) * np.eye(3) - second).ravel()
-        places[members, :3], places[members, 3] = arm, 1.0
+        scale = edge**dim * lattice_scale(dim, edge)
+        own = [scale * kernel(dim, np.sqrt(((arm - each) ** 2).sum(1))).sum() for each in arm]
+        places[members, :3], places[members, 3], places[members, 4] = arm, 1.0, own
         try:
             hull = ConvexHull(arm[:, :dim]).vertices
         except (QhullError, ValueError):

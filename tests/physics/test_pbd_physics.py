@@ -53,8 +53,8 @@ def test_what_falls_freely_follows_the_parabola(dim, flat, deep):
 def test_a_column_at_rest_keeps_its_height(counts, settled, flat, deep):
     """Sixteen layers for two seconds: nearly still, never denser than the error that solves end at.
 
-    The lattice of the start is not how water at rest is packed: at the same density, as the kernel tells it, that has 1 % (2D) and 3 % (3D, whatever the
-    support of the kernel) more particles in a volume. The column settles by so much in the first second, and no further.
+    The lattice of the start is not how water at rest is packed: at the same density, as the kernel tells it, that has 1 % (2D) and 3 % (3D,
+    whatever the support of the kernel) more particles in a volume. The column settles by so much in the first second, and no further.
     """
     dim = len(counts)
     what = scene([("water", [0] * dim, [counts[0], 16, 8][:dim])], 0.05, counts)
@@ -142,3 +142,14 @@ def test_a_cube_thrown_to_the_bottom_comes_up_again(deep):
     assert trajectory.ok
     lowest = trajectory.position[:, trajectory.particle_type == 0, 1].min(1)
     assert lowest.min() < 3 * what.spacing and lowest[-60:].mean() > 5 * what.spacing
+
+
+@pytest.mark.parametrize(("density", "rises"), [(700.0, True), (1500.0, False)])
+def test_a_cube_under_still_water(density, rises, deep):
+    """On the floor, water on it and around it but none below: a light one comes up, a heavy one stays."""
+    water = [([0, 0, 0], [8, 8, 12]), ([12, 0, 0], [20, 8, 12]), ([8, 0, 0], [12, 8, 4]), ([8, 0, 8], [12, 8, 12]), ([8, 4, 4], [12, 8, 8])]
+    what = scene([*(("water", *corners) for corners in water), ("cube", [8, 0, 4], [12, 4, 8])], 0.05, (20, 16, 12), density)
+    deep.load(what)
+    cube = what.particles().material == 1
+    lowest = [deep.frame()[cube, 1].min() / what.spacing for _ in range(120)]
+    assert min(lowest[60:]) > 3 if rises else max(lowest) < 0.6

@@ -122,11 +122,11 @@ def test_a_pair_by_hand(flat):
     0.53686; W / K = 0.9^4 x 1.4 = 0.91854: C = 0.53686 x 1.91854 - 1 = 0.0300. |G| = 20 V K 0.9^3 0.1 = 0.78274, D = 2 |G|^2 = 1.2254,
     k = C / 2 D = 0.01224; each moves by 2 k |G| = 0.01917."""
     flat.load(scene([("water", [0.5, 0.5], [0.625, 0.5625])]))
-    rho, D, dk, drift = iteration(flat, np.array([[4.0, 4.0], [4.1, 4.0]]))
+    rho, diagonal, dk, drift = iteration(flat, np.array([[4.0, 4.0], [4.1, 4.0]]))
     assert rho == pytest.approx([1.0300] * 2, abs=1e-4)
-    assert D == pytest.approx([1.2254] * 2, rel=1e-4)
+    assert diagonal == pytest.approx([1.2254] * 2, rel=1e-4)
     assert dk == pytest.approx([0.01224] * 2, rel=5e-3)
-    assert -drift == pytest.approx(np.array([[-0.01917, 0], [0.01917, 0]]), abs=1e-4)
+    np.testing.assert_allclose(drift, [[0.01917, 0], [-0.01917, 0]], atol=1e-4)
 
 
 def test_a_lattice_at_the_walls_is_at_rest_density(flat):
@@ -219,11 +219,10 @@ def momenta(solver, what):
     m = (density * particles.spacing**dim)[:, None]
     x, v = np.zeros((len(m), 3)), np.zeros((len(m), 3))
     x[:, :dim], v[:, :dim] = state["position"], state["velocity"]
-    own, bodies, h = np.zeros(3), solver._kernels.bodies, solver._support
+    own, bodies = np.zeros(3), solver._kernels.bodies
     for b, (first, last) in enumerate(bodies.span.to_numpy()[: bodies.count[None]]):
         spin = np.linalg.inv(_inertia(bodies, b)) @ bodies.momentum.to_numpy()[b]
         own += m[first, 0] * (last - first) * (what.spacing**2 / 12) * spin * ([2.0] * 3 if dim == 3 else [0, 0, 2.0])
-    assert h > 0
     return (m * v).sum(0), (m * np.cross(x, v)).sum(0) + own, (m * np.abs(v)).sum()
 
 
@@ -252,7 +251,7 @@ def test_momentum_of_a_body_struck_by_water(dim, flat, deep):
 
 
 def test_two_bodies_meet_by_the_same_constraint(deep):
-    """Head on, off centre: no overlap, momentum to rounding; energy falls, but for up to 2 % in the frame of the impact, whose displacements overshoot."""
+    """Head on, off centre: no overlap, momentum to rounding; energy falls, but for up to 2 % in the frame of the impact, which overshoots."""
     what = scene([("cube", [0.125, 0.375, 0.375], [0.375, 0.625, 0.625], [1.0, 0.0, 0.0]),
                   ("cube", [0.625, 0.4375, 0.3125], [0.875, 0.6875, 0.5625], [-0.5, 0.0, 0.0])], dim=3, gravity=[0.0] * 3)  # fmt: skip
     deep.load(what)
@@ -324,15 +323,15 @@ def test_a_shaken_box_is_gravity_that_leans(flat):
 
 REFUSED = {
     "sand": ({"materials": {"water": {"model": "sand", "young_modulus": 1e5, "friction_angle": 30}}}, r"materials\.water\.model = 'sand': .*MPM"),
-    "two waters": ({"materials": {"water": {"model": "water"}, "oil": {"model": "water", "density": 800}}}, r"materials\.oil\.model = 'water': .*one kind"),
+    "two waters": ({"materials": {"water": {"model": "water"}, "oil": {"model": "water", "density": 800}}}, r"materials\.oil\.model = .*one kind"),
     "viscosity": ({"materials": {"water": {"model": "water", "viscosity": 0.1}}}, r"materials\.water\.viscosity = 0\.1: .*xsph"),
     "friction": ({"walls": {"friction": 0.3}}, r"walls\.friction = 0\.3: .*slip"),
     "sticky": ({"walls": {"friction": "sticky"}}, r"walls\.friction = 'sticky': .*slip"),
     "periodic": ({"periodic": ["x"]}, r"periodic = \['x'\]: .*walls all around"),
     "obstacles": ({"obstacles": [{"kind": "ball", "radius": 0.1}]}, r"obstacles = \['ball'\]: .*none"),
-    "no iterations": ({"solver": {"method": "pbf", "iterations": 0}}, r"iterations = 0: "),
-    "strong s_corr": ({"solver": {"method": "pbf", "tensile": 0.1}}, r"tensile = 0\.1: "),
-    "another's setting": ({"solver": {"method": "pbf", "divergence_error": 0.1}}, r"divergence_error = 0\.1: unknown key"),
+    "no iterations": ({"solver": {"method": "pbf", "iterations": 0}}, r"yaml: solver\.iterations = 0: "),
+    "strong s_corr": ({"solver": {"method": "pbf", "tensile": 0.1}}, r"yaml: solver\.tensile = 0\.1: "),
+    "another's setting": ({"solver": {"method": "pbf", "divergence_error": 0.1}}, r"yaml: solver\.divergence_error = 0\.1: unknown key"),
 }
 FAMILY = {
     "name": "tiny", "dim": 2, "bounds": [[0.0, 1.0], [0.0, 1.0]], "gravity": [0.0, -9.8], "frame_step": 0.01, "frames": 12, "radius": 0.1,
@@ -372,7 +371,7 @@ def test_what_is_not_a_number_is_caught_and_named(flat):
 
 def test_a_solve_that_does_not_converge_fails_the_trajectory(flat):
     trajectory = simulate(flat, scene([("water", [0.0, 0.0], [1.0, 0.75])], solver={"method": "pbf", "iterations": 1}))
-    assert re.match(r"failed: densities did not converge in 1 iterations \(mean error 0\.00\d+\), at a step of 0\.005 s \(frame \d+\)", trajectory.status)
+    assert re.match(r"failed: densities did not converge in 1 iterations \(mean error 0\.00\d+\), at a step of 0\.005 s \(", trajectory.status)
 
 
 def test_every_frame_says_how_well_it_was_solved(flat):
