@@ -382,7 +382,8 @@ def trajectory(solver, what):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_the_same_bytes_twice_from_a_fresh_solver_and_one_that_ran_another_scene(method):
-    what, other = block(method, gravity=[0.0, -9.8]), block(method, lower=0.1, upper=0.85, gravity=[2.0, 5.0], jitter=0.3, seed=5)
+    what = block(method, lower=0.0, upper=0.5, gravity=[0.0, -9.8])
+    other = block(method, lower=0.1, upper=0.85, gravity=[2.0, 5.0], jitter=0.3, seed=5)
     fresh = trajectory(SPHSimulator(), what)
     solver = solver_for(what)
     simulate(solver, other)
@@ -415,6 +416,17 @@ def test_free_fall_in_a_shaken_box_is_exact(method):
         solver.frame()
         v = v + a[k] * 0.002
         assert solver.state()["velocity"] == pytest.approx(np.tile(v, (len(solver._position), 1)), abs=2e-5)
+
+
+def test_sound_does_not_grow_without_any_damping():
+    """A periodic box full of noise, two thousand steps at the default Courant number: it grew 3000-fold with densities predicted by rates alone."""
+    what = block("wcsph", lower=0.0, upper=1.0, periodic=["x", "y"], solver={"artificial_viscosity": 0.0, "density_diffusion": 0.0})
+    solver = stirred(what, 0.1)
+    start = solver.diagnostics()["kinetic_energy"]
+    for _ in range(800):
+        solver.frame()
+    found = solver.diagnostics()
+    assert found["substeps"] >= 2 and 0.5 * start < found["kinetic_energy"] + found["elastic_energy"] < 1.05 * start
 
 
 # -- guards
