@@ -484,6 +484,17 @@ def test_a_fixed_step_is_taken_whatever_the_limit_until_it_is_twice_as_long():
         solver.load(block("wcsph", time_step=0.001))
 
 
+def test_a_frame_may_take_as_many_steps_as_a_sliding_wall_asks_for():
+    """0.4 spacings at 10 m/s are 1.7 ms, a frame 200 ms: nothing but the wall moves at the start, and it is no runaway."""
+    what = block("dfsph", lower=0.0, upper=0.5, water={"viscosity": 100.0}, walls={"friction": "sticky", "velocity": {"y-": [10.0, 0.0]}})
+    what = Scene.from_dict(what.to_dict() | {"frame_step": 0.2, "frames": 2})
+    solver = solver_for(what)
+    solver.load(what)
+    assert SPHSimulator().plan(what)["substeps_per_frame"][0] == 120
+    solver.frame()
+    assert solver.diagnostics()["substeps"] >= 120
+
+
 # -- refusals
 
 FAMILY = {
