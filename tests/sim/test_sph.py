@@ -519,7 +519,7 @@ REFUSED = {
     "two waters": ({"materials": {"water": FAMILY["materials"]["water"], "brine": FAMILY["materials"]["water"]}},
                    r"materials.brine.model = 'water': SPH scenes hold one kind of water, here water"),
     "no water": ({"materials": {"water": {"model": "rigid", "density": 500.0}}}, r"materials = \['water'\]: SPH moves water, and rigid bodies in it"),
-    "small support": ({"solver": {"method": "wcsph", "support": 1.2}}, r"solver.wcsph.support = 1.2: must lie in 1.5 .. 4 particle spacings"),
+    "small support": ({"solver": {"method": "wcsph", "support": 1.2}}, r"solver.support = 1.2: must lie in 1.5 .. 4 particle spacings"),
     "radius": ({"radius": 0.04}, r"radius = 0.04: below the particle spacing 0.0416667"),
     "nobody": ({"bodies": []}, r"bodies = \[\]: an empty scene"),
 }  # fmt: skip
