@@ -26,9 +26,9 @@ Decisions, with what PositionBasedDynamics, FleX (Macklin et al. 2014) and our D
 - No vorticity confinement: it adds energy that nothing measures.
 
 Known: the start's cubic lattice is not how water packs, it settles by 3 % in 3D (1 % in 2D) whatever the kernel's support. The water keeps off a
-body a little further than off itself, so that the 4^3 cube of BOXBATH floats up to 0.12 spacings too high (density 300), and one of up to 1.2 times
-water's density comes to rest on the last two layers above the floor. k is no measure of pressure: it balances weights exactly, but through gradients of water
-that packs unevenly, and was 1.2 to 1.5 times rho g h.
+body a little further than off itself, so that the 4^3 cube of BOXBATH floats up to 0.12 spacings too high (density 300), and one of up to 1.2
+times water's density comes to rest on the last two layers above the floor. k is no measure of pressure: it balances weights exactly, but
+through gradients of water that packs unevenly, and was 1.2 to 1.5 times rho g h. Particles that start on each other are thrown apart.
 
 One kernel a frame on one thread, as in ``sim.sph.solver``; lengths in support radii, four lanes whatever the dimension.
 """
