@@ -42,7 +42,7 @@ def built(monkeypatch):
     compile_one = Kernel.materialize
 
     def materialize(self, *arguments, **options):
-        if self.func.__module__ in ("sim.mpm.solver", "sim.sph.solver"):
+        if self.func.__module__ in ("sim.mpm.solver", "sim.sph.solver", "sim.pbd.solver"):
             found["kernels"].add(self.func.__name__)
         return compile_one(self, *arguments, **options)
 

@@ -26,9 +26,9 @@ Decisions, with what PositionBasedDynamics, FleX (Macklin et al. 2014) and our D
 - No vorticity confinement: it adds energy that nothing measures.
 
 Known: the start's cubic lattice is not how water packs, it settles by 3 % in 3D (1 % in 2D) whatever the kernel's support. The water keeps off a
-body a little further than off itself, so that the 4^3 cube of BOXBATH floats 0.03 to 0.2 spacings too high, and one of up to 1.2 times water's
-density comes to rest on the last two layers above the floor. k is no measure of pressure: it balances weights exactly, but through gradients of water
-that packs unevenly, and was 1.2 to 1.5 times rho g h.
+body a little further than off itself, so that the 4^3 cube of BOXBATH floats up to 0.12 spacings too high (density 300), and one of up to 1.2
+times water's density comes to rest on the last two layers above the floor. k is no measure of pressure: it balances weights exactly, but
+through gradients of water that packs unevenly, and was 1.2 to 1.5 times rho g h. Particles that start on each other are thrown apart.
 
 One kernel a frame on one thread, as in ``sim.sph.solver``; lengths in support radii, four lanes whatever the dimension.
 """
@@ -43,7 +43,7 @@ from sim.mpm.decomposition import finite
 from sim.pbd.rigid import COLUMNS, Bodies, body_table
 from sim.scene import Scene
 from sim.simulator import Kind, SimulationError, Start
-from sim.sph.kernel import ENTRIES, SHARE, SLOPE, constant, lattice_scale, wall_table
+from sim.sph.kernel import ENTRIES, SHARE, SLOPE, constant, kernel, lattice_scale, wall_table
 from sim.sph.neighbours import SKIN, Neighbours
 from sim.taichi_runtime import compiling, start_taichi, ti
 
@@ -354,6 +354,8 @@ class _Kernels:
         report[self.ERROR] = ti.max(report[self.ERROR], ti.cast(error, ti.f64))
         report[self.UNSOLVED] += ti.cast(not error <= tolerance, ti.f64)
         for i in range(n):
+            # The last iteration only looked.
+            self.shift[i][3] -= self.sums[i][3]
             if self.body[i] < 0:
                 for d in ti.static(range(self.dim)):
                     self.v[i][d] += self.shift[i][d] / dt
@@ -519,11 +521,12 @@ class PBDSimulator:
         k, dim, solver = _Kernels, scene.dim, scene.solver
         spacing, support, cells = self._layout(scene)
         numbers, d, width = np.zeros((4, k.NUMBERS)), spacing / support, np.ptp(scene.bounds, axis=1) / support
-        row, scale = numbers[0], constant(dim) * lattice_scale(dim, d)
-        row[k.COUNT], row[k.VOLUME], row[k.KERNEL], row[k.SPACING] = particles, d**dim, scale, d
+        row = numbers[0]
+        row[k.COUNT], row[k.VOLUME], row[k.KERNEL], row[k.SPACING] = particles, d**dim, constant(dim) * lattice_scale(dim, d), d
         row[k.CFL], row[k.ERROR_AT_MOST] = self.settings["cfl"] or scene.cfl, solver.density_error * self.settings["tolerance"]
         row[k.ITERATIONS], row[k.XSPH], row[k.TENSILE] = solver.iterations, solver.xsph, solver.tensile * (solver.substeps / scene.frame_step) ** 2
-        row[k.NEAREST] = d**dim * scale * (1 - d) ** 4 * (1 + 4 * d)
+        # A hair below the spacing, lest rounding parts a lattice.
+        row[k.NEAREST] = d**dim * lattice_scale(dim, d) * kernel(dim, 0.999 * d)
         numbers[2, :dim] = width
         numbers[3, :dim], numbers[3, 4 : 4 + dim] = cells + 2, cells / width
         return numbers
