@@ -15,9 +15,9 @@ from scipy.optimize import curve_fit
 from sim.scene import Scene
 
 CASES = (
-    "rotation", "return_map", "hydrostatics", "elastic_column", "axial_bar", "cantilever", "standing_wave", "dam_break", "granular_collapse",
-    "block_on_plane", "elastic_discs", "float_and_sink", "viscoplastic_slump",
-    "sloshing",
+    "rotation", "return_map", "hydrostatics", "elastic_column", "axial_bar", "cantilever", "taylor_green", "channel", "lid_driven_cavity",
+    "standing_wave", "elliptical_drop", "dam_break", "dam_impact", "sloshing", "granular_collapse", "block_on_plane", "rotating_patch",
+    "elastic_discs", "float_and_sink", "viscoplastic_slump",
 )
 
 

@@ -10,7 +10,7 @@ from sim.validation import Curve, Outcome, scene, timed
 NUMBER = 11
 METHODS = ("wcsph", "dfsph")
 #: Particles along the drop's diameter.
-RESOLUTIONS = (20, 40, 80)
+RESOLUTIONS = (30, 60, 120)
 A0, C, WIDTH, END, FRAMES = 1.0, 15.0, 5.0, 1.0, 50
 
 
@@ -51,8 +51,8 @@ def run(resolution: int, method: str) -> Outcome:
 
 
 def settings(method: str) -> dict:
-    """No viscosity but the solver's own: no XSPH."""
-    return {"method": method} | ({"xsph": 0.0} if method == "dfsph" else {})
+    """No viscosity but the solver's own: no XSPH. A support of three spacings: with 2.5 the surface lies a quarter of a spacing farther out."""
+    return {"method": method, "support": 3.0} | ({"xsph": 0.0} if method == "dfsph" else {})
 
 
 def semi_axis(t: np.ndarray) -> np.ndarray:

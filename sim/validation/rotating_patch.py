@@ -10,7 +10,7 @@ from sim.validation.elliptical_drop import settings
 NUMBER = 14
 METHODS = ("wcsph", "dfsph")
 #: Particles along the patch.
-RESOLUTIONS = (20, 40, 80)
+RESOLUTIONS = (30, 60, 100)
 OMEGA, C, WIDTH, END, FRAMES = 1.0, 10.0, 4.0, 2.0, 40
 #: Points along a spacing at which the patch is looked at.
 FINE = 4
