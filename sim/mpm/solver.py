@@ -17,9 +17,10 @@ import numpy as np
 from sim.errors import InputError
 from sim.mpm.decomposition import finite
 from sim.mpm.materials import MODELS
-from sim.mpm.rigid import RigidBodies, body_table
+from sim.mpm.rigid import RigidBodies
 from sim.mpm.walls import solid, wall
 from sim.obstacles import THINNEST, combine
+from sim.rigid import body_table
 from sim.scene import Particles, Scene
 from sim.simulator import Kind, SimulationError, Start
 from sim.taichi_runtime import compiling, start_taichi, ti
@@ -122,7 +123,7 @@ class _Kernels:
             ti.field(ti.f32, capacity) if isinstance(field, ti.ScalarField) else ti.Vector.field(field.n, ti.f32, capacity) for field in self.state
         ]
         self.has_rigid = structure.rigid is not None
-        self.rigid = RigidBodies(self, *structure.rigid, capacity) if self.has_rigid else None
+        self.rigid = RigidBodies(self, *structure.rigid) if self.has_rigid else None
         if self.has_rigid:
             self.touched = ti.Vector.field(dim, ti.i32, 2)  # lowest and highest first node of a particle
         self.frame = (self.frame_rigid if self.has_rigid else self.frame_serial) if serial else self.frame_parallel
@@ -885,7 +886,7 @@ class MPMSimulator:
             if structure.obstacles != "none":
                 kernels.load_solids(self._solids(scene, nodes), columns)
             if structure.rigid:
-                kernels.load_rigid(body_table(scene, particles, data[:, : scene.dim].astype(float), self.dx, WALL, structure.rigid[1]))
+                kernels.load_rigid(body_table(scene, particles, data[:, : scene.dim].astype(float), self.dx, WALL, structure.rigid[1], 0.25))
             if fresh:
                 # Compiles all that a frame needs; the tiny step is taken back.
                 self._run(int(kernels.has_rigid), 1e-9, keep=True)

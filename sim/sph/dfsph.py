@@ -21,7 +21,11 @@ Viscosity is implicit, whatever its size: conjugate gradients for u + dt nu A su
 """
 
 from sim.mpm.decomposition import finite
+from sim.sph.rigid import RigidBodies
 from sim.taichi_runtime import ti
+
+#: Motions of rigid bodies, for those of the water.
+VELOCITY, PULL, SEARCH = RigidBodies.VELOCITY, RigidBodies.PULL, RigidBodies.SEARCH
 
 #: Iterations of a solve at least.
 LEAST = 2
@@ -41,6 +45,7 @@ class DFSPH:
 
     def __init__(self, base, capacity: int, pairs: int):
         self.base, self.dim, self.structure = base, base.dim, base.structure
+        self.rigid, self.has_rigid = base.rigid, base.has_rigid
         self.gradient = ti.Vector.field(4, ti.f32, pairs)  # G_ij of the pairs within reach, packed; lane 3: V W
         self.near = ti.field(ti.i32, pairs)
         self.begin = ti.field(ti.i32, capacity + 1)
@@ -69,6 +74,9 @@ class DFSPH:
             gradient[3] += V * K
             self.wall[i] = gradient
             self.members[i] = 0
+        if ti.static(self.has_rigid):
+            self.rigid.gather(n)
+            self.rigid.surround(self.wall, self.members)
         m = 0
         for i in range(n):
             self.begin[i] = m
@@ -112,8 +120,8 @@ class DFSPH:
             self.sums[i][3] = 1.0 / ti.max(norm, 1e-6)
 
     @ti.func
-    def rate(self, n, field: ti.template()):
-        """push[3]: rate of the density by a velocity or acceleration ``field``."""
+    def rate(self, n, field: ti.template(), motion: ti.template()):
+        """push[3]: rate of the density by a velocity or acceleration ``field`` of the water and a ``motion`` of the bodies."""
         for i in range(n):
             u, g = field[i], self.wall[i]
             self.push[i][3] = u[0] * g[0] + u[1] * g[1] + u[2] * g[2]
@@ -126,10 +134,12 @@ class DFSPH:
                 total += d
                 self.push[j][3] += d
             self.push[i][3] += total
+        if ti.static(self.has_rigid):
+            self.rigid.flow(self.push, motion)
 
     @ti.func
     def accelerate(self, n, pressure: ti.template(), which):
-        """push[:3]: accelerations by pressures, a lane of ``pressure``."""
+        """push[:3]: accelerations by pressures, a lane of ``pressure``; the bodies' too."""
         for i in range(n):
             self.push[i] = -pressure[i][which] * self.wall[i]
         for i in range(n):
@@ -140,6 +150,8 @@ class DFSPH:
                 total += f
                 self.push[j] += f
             self.push[i] -= total
+        if ti.static(self.has_rigid):
+            self.rigid.react(pressure, which)
 
     @ti.func
     def project(self, n, which, tolerance, most):
@@ -154,7 +166,7 @@ class DFSPH:
         iterations, error, pace, going = 0, 1e30, 1.0, 1
         while going:
             self.accelerate(n, self.pressure, which)
-            self.rate(n, self.push)
+            self.rate(n, self.push, PULL)
             error = 0.0
             for i in range(n):
                 left = self.source[i] + self.push[i][3]
@@ -163,10 +175,17 @@ class DFSPH:
             iterations += 1
             going = ti.cast(iterations < most and (iterations < LEAST or error > tolerance), ti.i32)
             if going:
+                if ti.static(self.has_rigid):
+                    for i in range(n):
+                        self.next[i] = self.source[i] + self.push[i][3]
+                    self.rigid.give_way(self.next, self.pressure, self.sums, which)
                 gain = 0.0
                 for i in range(n):
                     left = self.source[i] + self.push[i][3]
-                    k = ti.max(self.pressure[i][which] + RELAXATION * left * self.sums[i][3], 0.0)
+                    way = left
+                    if ti.static(self.has_rigid):
+                        way = self.next[i]
+                    k = ti.max(self.pressure[i][which] + RELAXATION * way * self.sums[i][3], 0.0)
                     gain += left * (k - self.last[i])
                     self.next[i] = k
                 ahead = 0.5 * (1.0 + ti.sqrt(1.0 + 4.0 * pace * pace))
@@ -184,7 +203,7 @@ class DFSPH:
     def conjugate(self, n, which, tolerance, most):
         """Conjugate gradients, preconditioned by alpha, for pressures of either sign; iterations and mean absolute error."""
         self.accelerate(n, self.pressure, which)
-        self.rate(n, self.push)
+        self.rate(n, self.push, PULL)
         power, error = ti.cast(0.0, ti.f64), 0.0
         for i in range(n):
             r = self.source[i] + self.push[i][3]
@@ -195,7 +214,7 @@ class DFSPH:
         iterations = 0
         while iterations < most and (iterations < LEAST or error > tolerance * ti.cast(n, ti.f32)) and power > 0.0:
             self.accelerate(n, self.krylov, 0)
-            self.rate(n, self.push)
+            self.rate(n, self.push, PULL)
             work = ti.cast(0.0, ti.f64)
             for i in range(n):
                 work -= ti.cast(self.krylov[i][0] * self.push[i][3], ti.f64)
@@ -221,7 +240,7 @@ class DFSPH:
         ``which`` is data, so that the code is there once. Pressures are times dt^2 throughout, accelerations too.
         """
         base = self.base
-        self.rate(n, base.v)
+        self.rate(n, base.v, VELOCITY)
         mean = 0.0
         for i in range(n):
             # Density after the step, above rest.
@@ -250,11 +269,13 @@ class DFSPH:
             for d in ti.static(range(self.dim)):
                 base.v[i][d] += self.push[i][d] / dt
             self.pressure[i][which] /= dt * dt
+        if ti.static(self.has_rigid):
+            self.rigid.accelerate(1.0 / dt)
         return iterations, error
 
     @ti.func
-    def viscous_image(self, n, dtnu, u: ti.template()):
-        """``image``: the viscous operator's of a velocity field."""
+    def viscous_image(self, n, dtnu, u: ti.template(), motion: ti.template()):
+        """``image``: the viscous operator's of a velocity field and a ``motion`` of the bodies."""
         base = self.base
         for i in range(n):
             ui = u[i]
@@ -273,13 +294,15 @@ class DFSPH:
             self.image[i] += total
         for i in range(n):
             self.image[i][3] = 0.0
+        if ti.static(self.has_rigid):
+            self.rigid.drag(u, self.image, dtnu, motion)
 
     @ti.func
     def thicken(self, n, dt, most):
         """Implicit viscosity; returns the iterations and the residual that is left, relative."""
         base = self.base
         dtnu = dt * base.number[base.VISCOSITY]
-        self.viscous_image(n, dtnu, base.v)
+        self.viscous_image(n, dtnu, base.v, VELOCITY)
         size, error = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
         for i in range(n):
             b = base.v[i]
@@ -290,21 +313,31 @@ class DFSPH:
             self.residual[i], self.search[i] = r, r
             size += ti.cast(b.norm_sqr(), ti.f64)
             error += ti.cast(r.norm_sqr(), ti.f64)
+        if ti.static(self.has_rigid):
+            more, left = self.rigid.resist()
+            size += more
+            error += left
         goal, iterations = ti.static(VISCOUS_ERROR**2) * size, 0
         while iterations < most and error > goal:
-            self.viscous_image(n, dtnu, self.search)
+            self.viscous_image(n, dtnu, self.search, SEARCH)
             power = ti.cast(0.0, ti.f64)
             for i in range(n):
                 power += ti.cast(self.search[i].dot(self.image[i]), ti.f64)
+            if ti.static(self.has_rigid):
+                power += self.rigid.work()
             step, left = ti.cast(error / power, ti.f32), ti.cast(0.0, ti.f64)
             for i in range(n):
                 base.v[i] += step * self.search[i]
                 r = self.residual[i] - step * self.image[i]
                 self.residual[i] = r
                 left += ti.cast(r.norm_sqr(), ti.f64)
+            if ti.static(self.has_rigid):
+                left += self.rigid.follow(step)
             turn = ti.cast(left / error, ti.f32)
             for i in range(n):
                 self.search[i] = self.residual[i] + turn * self.search[i]
+            if ti.static(self.has_rigid):
+                self.rigid.search(turn)
             error = left
             iterations += 1
         return iterations, ti.cast(ti.sqrt(error / ti.max(size, 1e-300)), ti.f32)
@@ -350,6 +383,8 @@ class DFSPH:
         deep = 0.0
         for d in ti.static(range(self.dim)):
             deep += ti.abs(g[d]) * (base.extent[1][d] - base.extent[0][d])
+        if ti.static(self.has_rigid):
+            fast = ti.max(fast, self.rigid.fastest[0])
         stiff = ti.min(2.0 * ti.max(total, 0.0) / ti.cast(n, ti.f32), fast + deep)
         fast = ti.sqrt(fast)
         speed = fast + ti.sqrt(stiff)
@@ -368,6 +403,8 @@ class DFSPH:
             if which == 1:
                 for i in range(n):
                     base.v[i] += dt * g
+                if ti.static(self.has_rigid):
+                    self.rigid.fall(dt, g)
                 if ti.static(self.structure.xsph):
                     self.smooth(n)
                 if ti.static(self.structure.viscous):
@@ -380,7 +417,13 @@ class DFSPH:
             report[base.SOLVED + which] += ti.cast(iterations, ti.f64)
             report[base.ERROR + which] = ti.max(report[base.ERROR + which], ti.cast(error, ti.f64))
             unsolved += ti.cast(not error <= tolerance, ti.i32)
+        if ti.static(self.has_rigid) and dt > 0.0:
+            self.rigid.find_contacts(dt)
+            self.rigid.solve()
+            self.rigid.keep_out(dt)
         for i in range(n):
             base.x[i] += dt * base.v[i]
             base.enclose(i)
+        if ti.static(self.has_rigid) and dt > 0.0:
+            self.rigid.step(dt)
         return unsolved

@@ -17,6 +17,8 @@ import numpy as np
 
 #: Entries of the tables over s in [0, 1].
 ENTRIES = 256
+#: Distance to a wall or body in support radii from which on its drag grows no more.
+CLOSEST = 0.1
 
 
 def constant(dim: int) -> float:

@@ -8,18 +8,34 @@ half-spaces (``sim.sph.kernel``), so there are no boundary particles to search.
 """
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from sim.errors import InputError
 from sim.mpm.decomposition import finite
 from sim.obstacles import combine
-from sim.scene import Incompressible, Scene
+from sim.rigid import NO_SLIP, body_table
+from sim.scene import Incompressible, Particles, Scene
 from sim.simulator import Kind, SimulationError, Start
 from sim.sph.dfsph import DFSPH, VISCOUS_ERROR
-from sim.sph.kernel import DRAG, ENTRIES, NORMAL, SHARE, SLOPE, SPREAD, TANGENT, constant, lattice_scale, lattice_slope, viscous_scale, wall_table
+from sim.sph.kernel import (
+    CLOSEST,
+    DRAG,
+    ENTRIES,
+    NORMAL,
+    SHARE,
+    SLOPE,
+    SPREAD,
+    TANGENT,
+    constant,
+    lattice_scale,
+    lattice_slope,
+    viscous_scale,
+    wall_table,
+)
 from sim.sph.neighbours import FEWEST, SKIN, Neighbours
+from sim.sph.rigid import RigidBodies, bare, corner_share, lightest
 from sim.sph.wcsph import LARGEST_COURANT, LARGEST_VISCOUS, WCSPH
 from sim.taichi_runtime import compiling, start_taichi, ti
 
@@ -31,8 +47,6 @@ MAX_HALVINGS = 6
 GROWTH = 2.0
 #: Share of the box from which on water counts as filling it, without a free surface.
 FULL = 0.999
-#: Distance to a wall in support radii from which on its drag grows no more.
-CLOSEST = 0.1
 #: Distance from a wall, in support radii, at which particles are stopped.
 HAIR = 1e-4
 #: Room in the list of pairs, as a multiple of those of a lattice at rest.
@@ -41,7 +55,7 @@ ROOM = 2.5
 
 @dataclass(frozen=True)
 class Structure:
-    """What is compiled in."""
+    """What is compiled in. rigid: (bodies, faces of one) at most, or None."""
 
     dim: int
     method: str
@@ -52,6 +66,7 @@ class Structure:
     xsph: bool
     full: bool
     obstacles: bool
+    rigid: tuple[int, int] | None
 
 
 def _capacity(particles: int) -> int:
@@ -60,20 +75,24 @@ def _capacity(particles: int) -> int:
     return -(-particles // step) * step
 
 
+def _power_of_two(n: int) -> int:
+    return 1 << max(n - 1, 7).bit_length()
+
+
 @ti.data_oriented
 class _Kernels:
     """Fields and compiled code for one ``Structure``."""
 
     #: Places in ``number``.
     (COUNT, VOLUME, KERNEL, SPACING, CFL, SOUND, GAMMA, VISCOSITY, ALPHA, DELTA, DENSITY_ERROR, DIVERGENCE_ERROR, ITERATIONS, THICKNESS, XSPH,
-     NUMBERS) = range(16)
+     ROUGH, LIGHT, CORNER, NUMBERS) = range(19)
     #: Places in a frame's report. Read from it are gravity, its change since the frame before, the frame's length, the longest step and whether
     #: all are to be so long, and the limit below which the frame ends.
     (STEPS, STEP, SPEED, SOLVED, ERROR, UNSOLVED, KINETIC, POTENTIAL, ELASTIC, DENSEST, BROKEN, FULL, LISTED, THICKENED, VISCOUS, OUTSIDE, LAST,
      LIMIT) = (0, 1, 2, 3, 5, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16, 17, 18, 19)
     GRAVITY, CHANGE, SPAN, CAP, FIXED, FLOOR, REPORT = 20, 23, 26, 27, 28, 29, 30
 
-    def __init__(self, structure: Structure, capacity: int, cells: int, pairs: int, nodes: tuple[int, ...]):
+    def __init__(self, structure: Structure, capacity: int, cells: int, pairs: int, wet: int, nodes: tuple[int, ...]):
         self.structure, self.capacity, self.dim, self.periodic = structure, capacity, structure.dim, structure.periodic
         self.number = ti.field(ti.f32, self.NUMBERS)
         self.x, self.v = (ti.Vector.field(4, ti.f32, capacity) for _ in range(2))
@@ -86,6 +105,8 @@ class _Kernels:
             self.solids = ti.Vector.field(self.dim + 1, ti.f32, nodes)  # normal and distance [support radii], a spacing apart
         self.slide = ti.Vector.field(4, ti.f32, self.faces)
         self.neighbours = Neighbours(self.dim, capacity, cells, pairs, self.periodic)
+        self.has_rigid = structure.rigid is not None
+        self.rigid = RigidBodies(self, *structure.rigid, wet) if self.has_rigid else None
         self.scheme = (DFSPH if structure.method == "dfsph" else WCSPH)(self, capacity, pairs)
         self.state = [self.x, self.v, *self.scheme.state]
         self.moved, self.saved = ([ti.Vector.field(field.n, ti.f32, capacity) for field in self.state] for _ in range(2))
@@ -205,8 +226,16 @@ class _Kernels:
 
     # -- pairs
     @ti.func
+    def everything(self, n):
+        """Particles of water and, behind them, of bodies."""
+        total = n
+        if ti.static(self.has_rigid):
+            total += self.rigid.members[None]
+        return total
+
+    @ti.func
     def list_pairs(self, n, report: ti.template()):
-        if self.neighbours.stale(self.x, n):
+        if self.neighbours.stale(self.x, self.everything(n)):
             self.neighbours.sort(self.x, n)
             for i in range(n):
                 k = self.neighbours.to[i]
@@ -218,6 +247,8 @@ class _Kernels:
                     self.state[f][i] = self.moved[f][i]
                 self.id[i] = self.moved_id[i]
             self.neighbours.pair(self.x, n)
+            if ti.static(self.has_rigid):
+                self.rigid.find_water(n)
             report[self.LISTED] += 1.0
 
     # -- kernels
@@ -235,6 +266,9 @@ class _Kernels:
                 x = self.x[i]
                 for d in ti.static(range(self.dim)):
                     outside += ti.cast(x[d] < self.extent[0][d] - HAIR, ti.i32) + ti.cast(x[d] > self.extent[1][d] + HAIR, ti.i32)
+            if ti.static(self.has_rigid) and keep == 1:
+                self.rigid.keep(False)
+                self.rigid.fastest[1] = self.rigid.fastest[0]
             g, change = ti.Vector.zero(ti.f32, 4), ti.Vector.zero(ti.f32, 4)
             for d in ti.static(range(self.dim)):
                 g[d], change[d] = ti.cast(report[self.GRAVITY + d], ti.f32), ti.cast(report[self.CHANGE + d], ti.f32)
@@ -286,6 +320,18 @@ class _Kernels:
                 squeeze += c * c / gamma * (gain + 1.0 / r - 1.0)
             dense = ti.max(dense, rho)
             wrong += ti.cast(not finite(x[0] + x[1] + x[2] + speed2 + rho) or rho <= 0.0, ti.i32)
+        if ti.static(self.has_rigid):
+            more, higher = self.rigid.energies(ti.Vector([ti.cast(report[self.GRAVITY + d], ti.f32) for d in ti.static(range(3))]))
+            kinetic += more
+            height += higher
+            fast = ti.max(fast, self.rigid.fastest[0])
+            for p in range(n, self.everything(n)):
+                place = 0.0
+                for d in ti.static(range(self.dim)):
+                    position[self.id[p], d] = self.x[p][d]
+                    place += self.x[p][d]
+                wrong += ti.cast(not finite(place), ti.i32)
+            wrong += ti.cast(not finite(ti.cast(kinetic, ti.f32)), ti.i32)
         report[self.KINETIC], report[self.POTENTIAL], report[self.ELASTIC], report[self.DENSEST] = kinetic, height, squeeze, ti.cast(dense, ti.f64)
         report[self.SPEED] = ti.max(report[self.SPEED], ti.cast(ti.sqrt(fast), ti.f64))
         report[self.BROKEN] = ti.cast(wrong + ti.cast(broken, ti.i32), ti.f64)
@@ -320,6 +366,23 @@ class _Kernels:
             self.neighbours.count[None] = 0
 
     @ti.kernel
+    def load_rigid(self, table: ti.types.ndarray(ti.f64, 2), order: ti.types.ndarray(ti.i32, 2)):
+        """Bodies as ``sim.rigid.body_table`` writes them; of each particle, water first, the place in the scene and which sides are bare."""
+        ti.loop_config(serialize=True)
+        for _ in range(1):
+            for i in range(order.shape[0]):
+                self.id[i], self.rigid.bare[i] = order[i, 0], order[i, 1]
+            self.rigid.load(table)
+            self.rigid.members[None] = order.shape[0] - ti.cast(self.number[self.COUNT], ti.i32)
+            fastest = 0.0
+            for b in range(self.rigid.count[None]):
+                if ti.static(self.structure.method == "wcsph"):
+                    self.rigid.force[b], self.rigid.torque[b] = ti.Vector.zero(ti.f64, 3), ti.Vector.zero(ti.f64, 3)
+                fastest = ti.max(fastest, self.rigid.write(b))
+                self.rigid.begin[b + 1] = 0
+            self.rigid.fastest[0] = fastest
+
+    @ti.kernel
     def load_solids(self, values: ti.types.ndarray(ti.f32, 2)):
         """[nodes, dim + 1] in the order of the indices."""
         for I in ti.grouped(self.solids):
@@ -339,6 +402,12 @@ class _Kernels:
                 self.id[i] = self.saved_id[i]
                 self.neighbours.listed_at[i] = ti.Vector([-10.0, 0.0, 0.0, 0.0])
             self.neighbours.count[None] = 0
+            if ti.static(self.has_rigid):
+                self.rigid.keep(True)
+                self.rigid.fastest[0] = self.rigid.fastest[1]
+                for b in range(self.rigid.count[None]):
+                    self.rigid.write(b)
+                    self.rigid.begin[b + 1] = 0
 
 
 class SPHSimulator:
@@ -371,7 +440,11 @@ class SPHSimulator:
         water = len(scene.particles(1).position) * scene.spacing**scene.dim
         full = solver.method == "dfsph" and water > FULL * np.prod(upper - lower)
         no_slip = viscous and scene.walls.friction == "sticky"
-        return Structure(scene.dim, solver.method, periodic, no_slip, viscous, shifting, xsph, full, bool(scene.obstacles))
+        # Rounded up, so that scenes of a family share their kernels.
+        bodies = [body for body in scene.bodies if scene.materials[body.material].model == "rigid"]
+        faces = max((len(body.vertices) if body.vertices else 6 for body in bodies), default=0)
+        rigid = (_power_of_two(len(bodies)), _power_of_two(faces)) if bodies else None
+        return Structure(scene.dim, solver.method, periodic, no_slip, viscous, shifting, xsph, full, bool(scene.obstacles), rigid)
 
     def _refine(self, scene: Scene) -> int:
         return scene.refine if self.settings["particles"] == "teacher" else 1
@@ -412,6 +485,8 @@ class SPHSimulator:
             # Its density is not a sum: only gradients use the kernel.
             row[k.KERNEL] *= lattice_slope(dim, d)
             row[k.GAMMA], row[k.ALPHA], row[k.DELTA] = water.gamma, solver.artificial_viscosity, solver.density_diffusion
+        row[k.CORNER] = corner_share(dim, d)
+        row[k.ROUGH], row[k.LIGHT] = NO_SLIP if scene.walls.friction == "sticky" else 0.0, self._lightness(scene)
         numbers[2, :dim], numbers[1, 4] = (upper - lower) / support, 1.0
         numbers[3, :dim], numbers[3, 4 : 4 + dim] = cells + 2, cells / ((upper - lower) / support)
         for face, velocity in scene.walls.velocity.items():
@@ -421,15 +496,33 @@ class SPHSimulator:
     def _water(self, scene: Scene):
         return next(material for material in scene.materials.values() if material.model == "water")
 
-    def _sizes(self, scene: Scene, structure: Structure, particles: int) -> tuple[int, int, int, tuple[int, ...]]:
-        """Room for particles, cells and pairs; nodes of the signed distance."""
+    def _water_first(self, scene: Scene, particles: Particles) -> tuple[np.ndarray, int]:
+        """Order in which particles are stored, bodies after water, and how many are water's."""
+        rigid = np.array([material.model == "rigid" for material in scene.materials.values()])[particles.material]
+        return np.argsort(rigid, kind="stable"), int((~rigid).sum())
+
+    def _lightness(self, scene: Scene) -> float:
+        """Largest c dt [support radii] of WCSPH with such bodies in the water (``sim.sph.rigid.lightest``): half of Verlet's limit, 2 / w."""
+        particles, (spacing, support, _) = scene.particles(self._refine(scene)), self._layout(scene)
+        order, water = self._water_first(scene, particles)
+        if scene.solver.method == "dfsph" or water == len(order):
+            return 1e30
+        bodies, d = order[water:], spacing / support
+        densities = np.array([material.density for material in scene.materials.values()]) / self._water(scene).density
+        layers = np.interp((np.arange(int(1 / d) + 1) + 0.5) * d, np.linspace(0, 1, ENTRIES + 1), wall_table(scene.dim, d)[:, SLOPE], right=0.0)
+        square = lightest(particles.position[bodies] / support, particles.body[bodies], densities[particles.material[bodies]], d, (layers**2).sum())
+        return float(1 / np.sqrt(square))
+
+    def _sizes(self, scene: Scene, structure: Structure, particles: int, bodies: int) -> tuple[int, int, int, int, tuple[int, ...]]:
+        """Room for particles, cells, pairs and pairs of bodies with water; nodes of the signed distance."""
         spacing, _, cells = self._layout(scene)
         capacity = _capacity(particles)
         reach = scene.solver.support * (1 + SKIN)
-        pairs = int(ROOM * {2: np.pi, 3: 4 * np.pi / 3}[scene.dim] * reach**scene.dim / 2 * capacity) + 4096
+        around = ROOM * {2: np.pi, 3: 4 * np.pi / 3}[scene.dim] * reach**scene.dim / 2
+        pairs, wet = int(around * capacity) + 4096, int(around * _capacity(bodies)) if bodies else 0
         lower, upper = np.array(scene.bounds).T
         nodes = tuple(int(np.ceil(length - 1e-6)) + 1 for length in (upper - lower) / spacing) if structure.obstacles else ()
-        return capacity, int(np.prod(cells + 2)), pairs, nodes
+        return capacity, int(np.prod(cells + 2)), pairs, wet, nodes
 
     def limits(self, scene: Scene, speed: float) -> dict[str, float]:
         """Bounds on the time step [s] at a speed of particles [m/s], by what sets them (h: half the support radius).
@@ -477,7 +570,8 @@ class SPHSimulator:
         """What ``load`` would build for a scene, without building it; see ``MPMSimulator.plan``."""
         structure, (_, support, cells) = self._structure(scene), self._layout(scene)
         dim, method, particles = scene.dim, scene.solver.method, scene.particles(self._refine(scene))
-        n, boxes, pairs, nodes = self._sizes(scene, structure, len(particles.position))
+        _, water = self._water_first(scene, particles)
+        n, boxes, pairs, wet, nodes = self._sizes(scene, structure, len(particles.position), len(particles.position) - water)
         state = {"x": 16, "v": 16} | ({"pressure": 8} if method == "dfsph" else {"rate": 16, "rate before": 16, "density rate before": 4})
         state |= {"crowd": 16} if structure.shifting else {}
         fields = {name: (size, n) for name, size in state.items()} | {f"moved {name}": (size, n) for name, size in state.items()}
@@ -492,11 +586,13 @@ class SPHSimulator:
             fields |= {"drag": (4, pairs), "residual": (16, n), "search": (16, n), "image": (16, n)}
         fields |= {"rub": (16, n)} if structure.no_slip and method == "wcsph" else {}
         fields |= {"signed distance": (4 * (dim + 1), int(np.prod(nodes)))} if structure.obstacles else {}
+        fields |= RigidBodies.fields(dim, *structure.rigid, n, wet, method == "wcsph", structure.viscous) if structure.rigid else {}
         context = scene.context_values()
         reasons = {
             "third dimension": "a 2D scene" if dim == 2 else None, "viscosity": None if structure.viscous else "inviscid water",
             "wall friction": None if structure.no_slip else "inviscid water" if scene.walls.friction == "sticky" else "slip walls",
             "signed distance": None if structure.obstacles else "no obstacles",
+            "rigid bodies": None if structure.rigid else "none in the scene",
             "periodic images": None if any(structure.periodic) else "walls all around",
             "context": "no moving container, no varying parameter" if context is None else None,
             "equation of state": "incompressible" if method == "dfsph" else None,
@@ -513,7 +609,7 @@ class SPHSimulator:
             "materials": [material.model for material in scene.materials.values()],
             "walls": "sticky" if structure.no_slip else "slip",
             "obstacles": len(scene.obstacles), "context": 0 if context is None else context.shape[1],
-            "kernels": ["load", "frame", "restore"] + ["load_solids"] * structure.obstacles, "fields": fields,
+            "kernels": ["load", "frame", "restore"] + ["load_solids"] * structure.obstacles + ["load_rigid"] * bool(structure.rigid), "fields": fields,
             "left_out": {what: why for what, why in reasons.items() if why}, "bytes": sum(size * count for size, count in fields.values()),
             "particles": len(particles.position), "recorded": len(particles.tracked) + len(scene.boundary), "kinematic": len(scene.boundary),
             "cells": cells.tolist(), "grid_spacing": support * (1 + SKIN), "wave_speed": water.sound_speed if method == "wcsph" else 0.0,
@@ -530,9 +626,10 @@ class SPHSimulator:
         structure, (spacing, support, _) = self._structure(scene), self._layout(scene)
         particles = scene.particles(self._refine(scene))
         n, dim = particles.position.shape
-        sizes = self._sizes(scene, structure, n)
+        order, self._wet = self._water_first(scene, particles)
+        sizes = self._sizes(scene, structure, n, n - self._wet)
         built = self._built
-        fits = built and built[0] == structure and built[4] == sizes[3] and all(have >= need for have, need in zip(built[1:4], sizes, strict=False))
+        fits = built and built[0] == structure and built[5] == sizes[4] and all(have >= need for have, need in zip(built[1:5], sizes, strict=False))
         if not fits:
             self._kernels = _Kernels(structure, *sizes)
             self._built = (structure, *sizes)
@@ -544,25 +641,37 @@ class SPHSimulator:
         position = particles.position
         if self.settings["perturbation"]:
             rng = np.random.default_rng(np.random.SeedSequence([scene.seed, 2]))
-            position = position + rng.uniform(-1, 1, position.shape) * self.settings["perturbation"]
+            noise = rng.uniform(-1, 1, position.shape)
+            for index in np.unique(particles.body[order[self._wet :]]):
+                noise[particles.body == index] = noise[particles.body == index][:1]
+            position = position + noise * self.settings["perturbation"]
         lower, upper = np.array(scene.bounds).T
         self._lower = lower
         inside = np.clip((position - lower) / support, HAIR, (upper - lower) / support - HAIR)
-        data = np.concatenate([inside, particles.velocity / support], 1).astype(np.float32)
+        data = np.concatenate([inside, particles.velocity / support], 1).astype(np.float32)[order]
         numbers = self._numbers(scene)
-        numbers[0, _Kernels.COUNT] = n
+        numbers[0, _Kernels.COUNT] = self._wet
         table = wall_table(dim, spacing / support)
         if scene.solver.method == "wcsph":
             table[:, [SLOPE, NORMAL, TANGENT, SPREAD]] *= lattice_slope(dim, spacing / support)
         table = table.astype(np.float32)
         with compiling(dim):
             if not fits:
-                self._kernels.restore(n)
+                self._kernels.restore(self._wet)
             self._kernels.load(data, numbers.astype(np.float32), table)
             if structure.obstacles:
-                nodes = np.stack(np.meshgrid(*[np.arange(count) for count in sizes[3]], indexing="ij"), -1).reshape(-1, dim)
+                nodes = np.stack(np.meshgrid(*[np.arange(count) for count in sizes[4]], indexing="ij"), -1).reshape(-1, dim)
                 distance, normal, _ = combine(scene.surfaces, lower + nodes * spacing)
                 self._kernels.load_solids(np.column_stack([normal, distance / support]).astype(np.float32))
+            if structure.rigid:
+                sorted_ = replace(particles, body=particles.body[order])
+                bodies = body_table(scene, sorted_, data[:, :dim].astype(float), support, 0.0, structure.rigid[1], (spacing / support) ** 2 / 12)
+                bodies[1:, 2] /= self._mass
+                bodies[1:, 9:12] /= support
+                bodies[1:, 12:21] /= self._mass
+                sides = np.zeros(n, np.int32)
+                sides[self._wet :] = bare(particles.position[order[self._wet :]], particles.body[order[self._wet :]], spacing) @ (1 << np.arange(2 * dim))
+                self._kernels.load_rigid(bodies, np.stack([order, sides], 1).astype(np.int32))
             self._settle()
         if not fits:
             self.compile_seconds += time.perf_counter() - begun
@@ -617,7 +726,7 @@ class SPHSimulator:
             if np.isfinite(report).all() and not report[k.BROKEN]:
                 self._frame, self._pull = self._frame + 1, felt
                 return self._recorded()
-            self._kernels.restore(len(self._position))
+            self._kernels.restore(self._wet)
             short = not report[k.LIMIT] >= floor
             cap = (cap if short else min(cap, report[k.LAST])) / 2
             if report[k.OUTSIDE] or report[k.FULL] or cap < floor * (1 - 1e-6):
@@ -682,6 +791,8 @@ class SPHSimulator:
             k = kernels.scheme.pressure.to_numpy()[:n][order].astype(float)
             # A kernel of few neighbours finds less than all of a gradient.
             found["pressure"] = k[:, 1] / lattice_slope(self._scene.dim, self._layout(self._scene)[0] / h) * water.density * h**2
+        order, wet = self._water_first(self._scene, self._scene.particles(self._refine(self._scene)))
+        found["density"][order[wet:]] = found["pressure"][order[wet:]] = np.nan
         return found
 
     def inject(self, name: str, particle: int | np.ndarray, value) -> None:
@@ -697,11 +808,13 @@ class SPHSimulator:
         field.from_numpy(whole)
 
     def set_velocity(self, velocity: np.ndarray) -> None:
-        """Replace the velocities [n, dim] of all particles. For starts that no scene describes."""
+        """Replace the velocities [n, dim] of all particles; a body takes their momenta. For starts that no scene describes."""
         kernels, (n, dim) = self._kernels, velocity.shape
         values = kernels.v.to_numpy()
         values[:n, :dim] = (velocity / self._support)[kernels.id.to_numpy()[:n]]
         kernels.v.from_numpy(values)
+        if kernels.rigid:
+            kernels.rigid.set_velocity(values[:, :3].astype(float))
         self._settle()
 
     # -- the Simulator contract

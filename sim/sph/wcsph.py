@@ -38,6 +38,7 @@ class WCSPH:
 
     def __init__(self, base, capacity: int, pairs: int):
         self.base, self.dim, self.structure = base, base.dim, base.structure
+        self.rigid, self.has_rigid = base.rigid, base.has_rigid
         self.rate = ti.Vector.field(4, ti.f32, capacity)  # acceleration; lane 3: rate of the density
         self.before = ti.Vector.field(4, ti.f32, capacity)
         self.earlier = ti.Vector.field(1, ti.f32, capacity)  # rate of the density a step before
@@ -107,6 +108,9 @@ class WCSPH:
                 self.crowd[i] += B
             if ti.static(self.structure.no_slip):
                 self.rub[i] += R
+        if ti.static(self.has_rigid):
+            self.rigid.gather(n)
+            self.rigid.press(self, g)
         for i in range(n):
             self.by_walls(i, g)
 
@@ -172,10 +176,14 @@ class WCSPH:
             u[3], a[3] = 0.0, 0.0
             fast, strong = ti.max(fast, u.norm_sqr()), ti.max(strong, a.norm_sqr())
             total += u.norm_sqr() + a.norm_sqr()
+        if ti.static(self.has_rigid):
+            fast = ti.max(fast, self.rigid.fastest[0])
         fast, strong = ti.sqrt(fast), ti.sqrt(strong)
         c = base.number[base.SOUND] * ti.pow(dense, 0.5 * (base.number[base.GAMMA] - 1.0))
         dt = ti.min(base.number[base.CFL] * base.number[base.SPACING] / (c + fast), 0.5 * LARGEST_COURANT / c)
         dt = ti.min(dt, 0.25 * ti.sqrt(0.5 / ti.max(strong, 1e-12)))
+        if ti.static(self.has_rigid):
+            dt = ti.min(dt, base.number[base.LIGHT] / c)
         return ti.min(dt, 0.25 * LARGEST_VISCOUS / ti.max(base.number[base.VISCOSITY], 1e-12)), fast, finite(total)
 
     @ti.func
@@ -188,6 +196,9 @@ class WCSPH:
     def step(self, n, dt, g, report: ti.template()):
         """One step; ``rate`` is that of its start, which a step of no length finds. Returns how many solves failed: there are none."""
         base = self.base
+        if ti.static(self.has_rigid) and dt > 0.0:
+            self.rigid.keep_out(dt)
+            self.rigid.drift(dt, g)
         shift = 0.0
         if ti.static(self.structure.shifting):
             shift = 2.0 * dt * base.stir(n)
@@ -197,6 +208,9 @@ class WCSPH:
             trend = 2.0 * a[3] - self.earlier[i][0]
             self.earlier[i][0] = a[3]
             self.before[i] = ti.Vector([a[0], a[1], a[2], trend])
+            if ti.static(self.has_rigid) and dt == 0.0:
+                # Of a start nothing is known: no pressure.
+                self.before[i] = g
             a[3] = 0.5 * (a[3] + trend)
             move = dt * base.v[i] + (0.5 * dt * dt) * a
             if ti.static(self.structure.shifting):
@@ -215,4 +229,6 @@ class WCSPH:
             base.v[i][3] = ti.select(inside, base.v[i][3], ti.max(base.v[i][3], 1.0))
             if dt == 0.0:
                 self.earlier[i][0] = self.rate[i][3]
+        if ti.static(self.has_rigid) and dt > 0.0:
+            self.rigid.correct(dt)
         return 0

@@ -6,8 +6,8 @@ from scipy.spatial.distance import pdist
 
 from sim.generate import simulate
 from sim.mpm import solver as solver_module
-from sim.mpm.rigid import rotation, turned
 from sim.mpm.solver import WALL, MPMSimulator
+from sim.rigid import rotation, turned
 from sim.scene import Scene
 from sim.taichi_runtime import start_taichi, ti
 from sim.trajectory import PARTICLE_TYPES
