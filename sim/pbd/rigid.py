@@ -21,7 +21,7 @@ Lengths are in support radii, masses in those of a particle of the body. Float64
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
-from sim.mpm.rigid import rotation, turned
+from sim.rigid import rotation, turned
 from sim.scene import Particles, Scene
 from sim.sph.kernel import ENTRIES, SHARE, SLOPE, kernel, lattice_scale
 from sim.taichi_runtime import ti
