@@ -266,9 +266,10 @@ class _Kernels:
                 x = self.x[i]
                 for d in ti.static(range(self.dim)):
                     outside += ti.cast(x[d] < self.extent[0][d] - HAIR, ti.i32) + ti.cast(x[d] > self.extent[1][d] + HAIR, ti.i32)
-            if ti.static(self.has_rigid) and keep == 1:
-                self.rigid.keep(False)
-                self.rigid.fastest[1] = self.rigid.fastest[0]
+            if ti.static(self.has_rigid):
+                if keep == 1:
+                    self.rigid.keep(False)
+                    self.rigid.fastest[1] = self.rigid.fastest[0]
             g, change = ti.Vector.zero(ti.f32, 4), ti.Vector.zero(ti.f32, 4)
             for d in ti.static(range(self.dim)):
                 g[d], change[d] = ti.cast(report[self.GRAVITY + d], ti.f32), ti.cast(report[self.CHANGE + d], ti.f32)

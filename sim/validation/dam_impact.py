@@ -25,6 +25,9 @@ def run(resolution: int, method: str) -> Outcome:
     The sensor is 0.01 H above the floor, below the lowest particle: what is compared is the mean pressure, none where there is no particle, over a
     strip 2 spacings wide and 4 high at the foot of the wall. Arrival: when that exceeds 0.2 rho g H; impulse: its integral over the unit of
     time after. Never the peak.
+
+    All three solvers arrive in time. Their impulse is missed, and by all in the same way: it grows with the resolution, as the strip shrinks from a
+    quarter to a sixteenth of H, past what was measured.
     """
     spacing = H / resolution
     length = float(np.ceil(161 / 30 * H / (2 * spacing) - 1e-9) * 2 * spacing)
@@ -48,14 +51,16 @@ def run(resolution: int, method: str) -> Outcome:
 
     def impact(T, p):
         begun = T[np.argmax(p > ARRIVED)]
-        after = (T >= begun) & (T <= begun + LAST)
+        after = (begun <= T) & (begun + LAST >= T)
         return begun, np.trapezoid(p[after], T[after])
 
     (arrival, impulse), (measured_arrival, measured_impulse) = impact(T, p), impact(measured_T, measured)
     reference = np.interp(T, measured_T, measured)
     axes = ("T = t sqrt(g / H)", "p / rho g H")
     curves = {
-        "arrival": Curve(f"arrival {arrival:.3f}, measured {measured_arrival:.3f}", axes, T, reference, p, float(arrival / measured_arrival - 1), 0.03),
-        "impulse": Curve(f"impulse {impulse:.3f}, measured {measured_impulse:.3f}", axes, T, reference, p, float(impulse / measured_impulse - 1), 0.15),
+        "arrival": Curve(f"arrival {arrival:.3f}, measured {measured_arrival:.3f}", axes, T, reference, p,
+                         float(arrival / measured_arrival - 1), 0.03),
+        "impulse": Curve(f"impulse {impulse:.3f}, measured {measured_impulse:.3f}", axes, T, reference, p,
+                         float(impulse / measured_impulse - 1), 0.15),
     }  # fmt: skip
     return Outcome("dam_impact", resolution, len(what.particles().position), curves, seconds)

