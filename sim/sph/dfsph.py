@@ -417,13 +417,11 @@ class DFSPH:
             report[base.SOLVED + which] += ti.cast(iterations, ti.f64)
             report[base.ERROR + which] = ti.max(report[base.ERROR + which], ti.cast(error, ti.f64))
             unsolved += ti.cast(not error <= tolerance, ti.i32)
-        if ti.static(self.has_rigid) and dt > 0.0:
-            self.rigid.find_contacts(dt)
-            self.rigid.solve()
-            self.rigid.keep_out(dt)
+        if ti.static(self.has_rigid):
+            self.rigid.collide(dt)
         for i in range(n):
             base.x[i] += dt * base.v[i]
             base.enclose(i)
-        if ti.static(self.has_rigid) and dt > 0.0:
+        if ti.static(self.has_rigid):
             self.rigid.step(dt)
         return unsolved

@@ -196,8 +196,7 @@ class WCSPH:
     def step(self, n, dt, g, report: ti.template()):
         """One step; ``rate`` is that of its start, which a step of no length finds. Returns how many solves failed: there are none."""
         base = self.base
-        if ti.static(self.has_rigid) and dt > 0.0:
-            self.rigid.keep_out(dt)
+        if ti.static(self.has_rigid):
             self.rigid.drift(dt, g)
         shift = 0.0
         if ti.static(self.structure.shifting):
@@ -208,9 +207,9 @@ class WCSPH:
             trend = 2.0 * a[3] - self.earlier[i][0]
             self.earlier[i][0] = a[3]
             self.before[i] = ti.Vector([a[0], a[1], a[2], trend])
-            if ti.static(self.has_rigid) and dt == 0.0:
+            if ti.static(self.has_rigid):
                 # Of a start nothing is known: no pressure.
-                self.before[i] = g
+                self.before[i] = ti.select(dt > 0.0, self.before[i], g)
             a[3] = 0.5 * (a[3] + trend)
             move = dt * base.v[i] + (0.5 * dt * dt) * a
             if ti.static(self.structure.shifting):
@@ -229,6 +228,6 @@ class WCSPH:
             base.v[i][3] = ti.select(inside, base.v[i][3], ti.max(base.v[i][3], 1.0))
             if dt == 0.0:
                 self.earlier[i][0] = self.rate[i][3]
-        if ti.static(self.has_rigid) and dt > 0.0:
+        if ti.static(self.has_rigid):
             self.rigid.correct(dt)
         return 0
