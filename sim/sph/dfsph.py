@@ -418,14 +418,10 @@ class DFSPH:
             report[base.ERROR + which] = ti.max(report[base.ERROR + which], ti.cast(error, ti.f64))
             unsolved += ti.cast(not error <= tolerance, ti.i32)
         if ti.static(self.has_rigid):
-            if dt > 0.0:
-                self.rigid.find_contacts(dt)
-                self.rigid.solve()
-                self.rigid.keep_out(dt)
+            self.rigid.collide(dt)
         for i in range(n):
             base.x[i] += dt * base.v[i]
             base.enclose(i)
         if ti.static(self.has_rigid):
-            if dt > 0.0:
-                self.rigid.step(dt)
+            self.rigid.step(dt)
         return unsolved

@@ -10,15 +10,16 @@ one entry a pair of particle and body (t: along the face, z: across it, from a p
 
 Decisions:
 - Volumes. Akinci et al. give boundary particles 1 / sum_p W, for bodies sampled by one layer on their surface. Ours are filled, and the lattice
-  goes on across a face: V = spacing^dim is right for water on it, while 1 / sum_p W makes the outermost layer a third larger (2D, support of 2 spacings),
-  so that water stays a fifth of a spacing away and the body displaces more than it is.
+  goes on across a face: V = spacing^dim is right for water on it, while 1 / sum_p W makes the outermost layer larger,
+  so that water stays further away and the body displaces more than it is.
 - Pressure. DFSPH: a_i = -k_i g_i, the transpose of the rate of the density, as at walls (``sim.sph.dfsph``; Akinci et al. 2012, eq. 9): the solves
   then are projections of the velocities of water *and bodies*, and buoyancy is the water's weight by virtual work. WCSPH: pressures are known, not
   solved for, and continue across the face by their own gradient (Adami et al. 2012, in its place gravity): p_p = p_i + grad p . (x_p - x_i).
 - Strong coupling. Each iteration of DFSPH's solves includes the motion that its pressures give to the bodies: the operator gains h_i . h_j / m,
   of rank 3 (2D) or 6 a body, far larger than its diagonal where bodies are light, and Jacobi's iterations diverge. They are preconditioned by it:
   with B = (h_i; l_i), g and its torque and the films' part, D the diagonal and R^-1 a body's mass and inertia, (D + B R B^T)^-1 costs a solve of
-  6 x 6 a body (Woodbury 1950), over the particles that press or are about to. Gissler et al. (2019), who interlink solves of water and contacts, relax instead.
+  6 x 6 a body (Woodbury 1950), over the particles that press or are about to. Gissler et al. (2019), who interlink
+  solves of water and contacts, relax instead.
 - Films. Between a wall and a face nearer than a particle is thick no water fits, and without any a light body would stay on the floor for ever.
   A gap that opens draws water from its rim: the rate of the density of water there loses the film's area times the body's speed away from
   the wall, and by the transpose the rim's pressure acts on that area (``film``); where the rim is dry, by as much less. Between bodies there are
@@ -230,19 +231,21 @@ class RigidBodies(Bodies):
                     s, n[d] = x[d] - self.kernels.extent[0][d], 1.0
                 if f == 2 * d + 1:
                     s, n[d] = self.kernels.extent[1][d] - x[d], -1.0
-        if ti.static(self.obstacles) and f == 2 * self.dim:
-            s, n, _ = self.obstacle(x)
+        if ti.static(self.obstacles):
+            far, out, _rough = self.obstacle(x)
+            if f == 2 * self.dim:
+                s, n = far, out
         return s, n
 
     @ti.func
     def film(self, b, f):
         """Add to h and l of the water at the rim of the film between body b and wall f.
 
-        The film is on the sides of the body's lattice that face the wall, nearer than THIN spacings, as far as water's particles do not fill the gap:
-        the sum, at the body's particle, of the kernels of those beyond its side over that of a gap full of water. Its pressure is what the water pushes with, along the
-        wall, on the sides of the body next to it, BAND spacings high, over their area: sum_i k_i |sum_p V grad W_ip| (``corner_share``). The pressures of single
-        particles will not do: those of DFSPH are up to 2.2 times the water's in a corner, and a tenth more than the water's bears, half a metre
-        deep, a stone a tenth of a metre high."""
+        The film is on the sides of the body's lattice that face the wall, nearer than THIN spacings, as far as water's particles do not fill the
+        gap: the sum, at the body's particle, of the kernels of those beyond its side over that of a gap full of water. Its pressure is what the
+        water pushes with, along the wall, on the sides of the body next to it, BAND spacings high, over their area: sum_i k_i |sum_p V grad W_ip|
+        (``corner_share``). The pressures of single particles will not do: those of DFSPH are up to 2.2 times the water's in a corner, and a tenth
+        more than the water's bears, half a metre deep, a stone a tenth of a metre high."""
         base, spacing = self.kernels, 2.0 * self.half[None]
         lowest = OVERFLOW
         for p in range(self.span[b][0], self.span[b][1]):
@@ -456,7 +459,7 @@ class RigidBodies(Bodies):
                 for d in ti.static(range(3)):
                     A[d] += f[d]
                 film, twist = self.h[m] - slope, self.l[m] - self.r[m].cross(slope)
-                # As at walls: what leaves the body leaves nothing behind that could hold it, and what nothing presses on is not within the water.
+                # As at walls: what leaves the body leaves nothing behind that could hold it, and what presses on nothing is no inner particle.
                 pressed = base.v[i][3] > 1.0
                 A[3] += ti.select(pressed, u.dot(slope), ti.max(u.dot(slope), 0.0)) - ti.cast(self.velocity[b].dot(film) + self.spin[b].dot(twist), ti.f32)
                 F += ti.max(base.x[i][3], 0.0) * film
@@ -480,7 +483,9 @@ class RigidBodies(Bodies):
         """The first half of a step of velocity Verlet: to the new places by the velocities of its middle, then those predicted for its end.
 
         Contacts hold both: an impulse at the middle alone would leave half a step's weight on a body at rest."""
-        for half in range(2):
+        if dt > 0.0:
+            self.keep_out(dt)
+        for half in range(ti.select(dt > 0.0, 2, 0)):
             if half == 1:
                 self.step(dt)
             self.kick(0.5 * dt, g)
@@ -508,13 +513,22 @@ class RigidBodies(Bodies):
             self.velocity[b] += dt * lift(g)
 
     @ti.func
+    def collide(self, dt):
+        """Contacts with walls and each other, then with water that pressures have not kept out."""
+        if dt > 0.0:
+            self.find_contacts(dt)
+            self.solve()
+            self.keep_out(dt)
+
+    @ti.func
     def step(self, dt):
         """To their new places; what contacts beyond the list's room fail with is a list of pairs that is full."""
-        fastest = self.travel(dt)
-        if fastest >= OVERFLOW:
-            self.kernels.neighbours.count[None] = self.kernels.neighbours.other.shape[0]
-        else:
-            self.fastest[0] = fastest
+        if dt > 0.0:
+            fastest = self.travel(dt)
+            if fastest >= OVERFLOW:
+                self.kernels.neighbours.count[None] = self.kernels.neighbours.other.shape[0]
+            else:
+                self.fastest[0] = fastest
 
     @ti.func
     def keep_out(self, dt):

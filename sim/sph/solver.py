@@ -267,7 +267,7 @@ class _Kernels:
                 for d in ti.static(range(self.dim)):
                     outside += ti.cast(x[d] < self.extent[0][d] - HAIR, ti.i32) + ti.cast(x[d] > self.extent[1][d] + HAIR, ti.i32)
             if ti.static(self.has_rigid):
-                if keep == 1:
+                for _again in range(keep):
                     self.rigid.keep(False)
                     self.rigid.fastest[1] = self.rigid.fastest[0]
             g, change = ti.Vector.zero(ti.f32, 4), ti.Vector.zero(ti.f32, 4)
@@ -610,7 +610,8 @@ class SPHSimulator:
             "materials": [material.model for material in scene.materials.values()],
             "walls": "sticky" if structure.no_slip else "slip",
             "obstacles": len(scene.obstacles), "context": 0 if context is None else context.shape[1],
-            "kernels": ["load", "frame", "restore"] + ["load_solids"] * structure.obstacles + ["load_rigid"] * bool(structure.rigid), "fields": fields,
+            "kernels": ["load", "frame", "restore"] + ["load_solids"] * structure.obstacles + ["load_rigid"] * bool(structure.rigid),
+            "fields": fields,
             "left_out": {what: why for what, why in reasons.items() if why}, "bytes": sum(size * count for size, count in fields.values()),
             "particles": len(particles.position), "recorded": len(particles.tracked) + len(scene.boundary), "kinematic": len(scene.boundary),
             "cells": cells.tolist(), "grid_spacing": support * (1 + SKIN), "wave_speed": water.sound_speed if method == "wcsph" else 0.0,
@@ -670,8 +671,8 @@ class SPHSimulator:
                 bodies[1:, 2] /= self._mass
                 bodies[1:, 9:12] /= support
                 bodies[1:, 12:21] /= self._mass
-                sides = np.zeros(n, np.int32)
-                sides[self._wet :] = bare(particles.position[order[self._wet :]], particles.body[order[self._wet :]], spacing) @ (1 << np.arange(2 * dim))
+                sides, mine = np.zeros(n, np.int32), order[self._wet :]
+                sides[self._wet :] = bare(particles.position[mine], particles.body[mine], spacing) @ (1 << np.arange(2 * dim))
                 self._kernels.load_rigid(bodies, np.stack([order, sides], 1).astype(np.int32))
             self._settle()
         if not fits:

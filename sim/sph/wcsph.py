@@ -197,9 +197,7 @@ class WCSPH:
         """One step; ``rate`` is that of its start, which a step of no length finds. Returns how many solves failed: there are none."""
         base = self.base
         if ti.static(self.has_rigid):
-            if dt > 0.0:
-                self.rigid.keep_out(dt)
-                self.rigid.drift(dt, g)
+            self.rigid.drift(dt, g)
         shift = 0.0
         if ti.static(self.structure.shifting):
             shift = 2.0 * dt * base.stir(n)
@@ -210,9 +208,8 @@ class WCSPH:
             self.earlier[i][0] = a[3]
             self.before[i] = ti.Vector([a[0], a[1], a[2], trend])
             if ti.static(self.has_rigid):
-                if dt == 0.0:
-                    # Of a start nothing is known: no pressure.
-                    self.before[i] = g
+                # Of a start nothing is known: no pressure.
+                self.before[i] = ti.select(dt > 0.0, self.before[i], g)
             a[3] = 0.5 * (a[3] + trend)
             move = dt * base.v[i] + (0.5 * dt * dt) * a
             if ti.static(self.structure.shifting):
@@ -232,6 +229,5 @@ class WCSPH:
             if dt == 0.0:
                 self.earlier[i][0] = self.rate[i][3]
         if ti.static(self.has_rigid):
-            if dt > 0.0:
-                self.rigid.correct(dt)
+            self.rigid.correct(dt)
         return 0

@@ -73,8 +73,9 @@ def test_a_body_and_the_water_on_it_fall_freely(solvers, method):
     lag = t / steps if method == "dfsph" else 0.0
     shift = np.array([0.2 * t, 0.3 * t - 9.8 * t * (t + lag) / 2])
     # Steps of DFSPH are not all as long: the mean of their lags, weighed by time, is within a tenth of it.
+    # Water's velocities, of up to 2 m/s, are rounded to half an eps of that in each of 360 steps.
     assert np.abs(last - start - shift).max() < 20 * EPS * 16 / 2 + 0.1 * 9.8 * t * lag / 2
-    assert np.abs(pdist(last.astype(float)) - pdist(start)).max() < 20 * EPS
+    assert np.abs(pdist(last.astype(float)) - pdist(start)).max() < 360 * EPS / 2 * t * 2
 
 
 @pytest.mark.parametrize("viscosity", [0.0, 20.0])
@@ -154,7 +155,7 @@ def test_a_plate_drags_viscous_water_along():
     layer, speed, nu = 0.25, 0.5, 0.2
     what = scene("dfsph", [("water", box([0.0, 0.0], [0.5, layer])), ("wood", box([0.0, layer], [0.5, 0.375], [speed, 0.0]))],
                  wood=WOOD | {"density": 1e6}, water=WATER | {"viscosity": 1000.0 * nu}, gravity=[0.0, 0.0], bounds=[[0.0, 0.5], [0.0, 0.5]],
-                 periodic=["x"], walls={"friction": "sticky"}, frame_step=0.01)
+                 periodic=["x"], walls={"friction": "sticky"}, frame_step=0.01, solver={"iterations": 1000})
     solver = SPHSimulator()
     solver.load(what)
     for _ in range(round(1.5 * layer**2 / nu / what.frame_step)):
