@@ -13,6 +13,7 @@ from sim.errors import InputError
 from sim.generate import simulate
 from sim.scene import Scene, SceneFamily
 from sim.simulator import SimulationError
+from sim.sph.dfsph import SEARCH, VELOCITY
 from sim.sph.kernel import DRAG, ENTRIES, NORMAL, SHARE, SLOPE, SPREAD, TANGENT, kernel, lattice_scale, lattice_slope, slope, wall_table
 from sim.sph.neighbours import SKIN
 from sim.sph.solver import HAIR, SPHSimulator
@@ -264,13 +265,13 @@ def accelerate(scheme: ti.template(), n: ti.i32):
 @ti.kernel
 def rate(scheme: ti.template(), n: ti.i32):
     for _ in range(1):
-        scheme.rate(n, scheme.base.v)
+        scheme.rate(n, scheme.base.v, VELOCITY)
 
 
 @ti.kernel
 def viscous(scheme: ti.template(), n: ti.i32, dtnu: ti.f32):
     for _ in range(1):
-        scheme.viscous_image(n, dtnu, scheme.search)
+        scheme.viscous_image(n, dtnu, scheme.search, SEARCH)
 
 
 @pytest.mark.parametrize(("dim", "lower"), [(2, 0.3), (2, 0.0), (3, 0.0)])
