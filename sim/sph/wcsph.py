@@ -153,8 +153,7 @@ class WCSPH:
                     # walls one behind the other the half-spaces overlap. No pressure there is below zero.
                     whole = beside if ti.static(f == 2 * self.dim) else 1.0 - solid * n.dot(m) ** 2
                     A += whole * ti.max(-2.0 * P * T[SLOPE] - gn * T[NORMAL], -P * T[SLOPE]) * n
-                    # Water that leaves a wall leaves nothing behind that could hold it.
-                    A[3] += weight * T[SLOPE] * ti.select(u[3] > 1.0, un, ti.min(un, 0.0))
+                    A[3] += weight * T[SLOPE] * un
                     if ti.static(self.structure.shifting):
                         C = T[SLOPE] * n
                         # A wall that presses on nothing does not make a particle an inner one: it would be shifted into the gap.

@@ -51,7 +51,8 @@ def run(resolution: int, method: str) -> Outcome:
 
 
 def settings(method: str) -> dict:
-    """No viscosity but the solver's own: no XSPH. A support of three spacings: with 2.5 the surface lies a quarter of a spacing farther out."""
+    """No viscosity but the solver's own: no XSPH. A support of three spacings: with 2.5
+    the area of 40 particles' drop is 2.2 % off, with 3 it is 0.5 %."""
     return {"method": method, "support": 3.0} | ({"xsph": 0.0} if method == "dfsph" else {})
 
 

@@ -22,7 +22,7 @@ def run(resolution: int, method: str) -> Outcome:
     The pressure is negative all over it: what tears easily. Area: within 0.75 spacings of a particle, less what that is at the start beyond the
     square; a lattice that is as dense has no gap as wide. Voids: area of the holes in it, what is not within it and not connected with the outside.
 
-    Voids are missed: holes of about a spacing, half a percent of the area and fewer with more particles. DFSPH knows no
+    Voids are missed: half a percent of the area, less with more particles. DFSPH knows no
     tension at all and lets the patch fly apart; what its row shows is that it keeps the angular momentum.
     """
     from scipy.ndimage import label

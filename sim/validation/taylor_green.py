@@ -21,7 +21,7 @@ def run(resolution: int, method: str) -> Outcome:
     spacings, 5 % with 3, 0.6 % with 3.5.
 
     DFSPH misses it, from a lattice and with a support of 3 spacings. In a box without a surface its pressures have either sign; where they are
-    negative, particles pair. The solver does not see that, since it holds densities to their mean, which rises over the run: by 7 %, with a support
+    negative, particles seem to pair: the solver holds densities to their mean, and that rises over the run: by 7 %, with a support
     of two spacings by a third (and the decay is 70 % too fast). From a jittered lattice its solves do not converge.
     """
     settings = {"support": 3.5, "artificial_viscosity": 0.0} if method == "wcsph" else {"support": 3.0, "xsph": 0.0}
