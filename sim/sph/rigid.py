@@ -450,24 +450,18 @@ class RigidBodies(Bodies):
                 A, slope = scheme.rate[i], lift(self.g[m])
                 u = lift(base.v[i]) - self.there(b, m, self.VELOCITY)
                 f = self.M[m] @ lift(scheme.before[i] - g) - 2.0 * ti.max(base.x[i][3], 0.0) * slope
-                # Nor is the pressure in the body below zero.
-                steep = slope.norm()
-                away = slope / ti.max(steep, 1e-12)
-                f -= ti.max(f.dot(away) + ti.max(base.x[i][3], 0.0) * steep, 0.0) * away
                 if ti.static(self.viscous):
                     f -= nu * self.rub(m, u)
                 for d in ti.static(range(3)):
                     A[d] += f[d]
                 film, twist = self.h[m] - slope, self.l[m] - self.r[m].cross(slope)
-                # As at walls: what leaves the body leaves nothing behind that could hold it, and what presses on nothing is no inner particle.
-                pressed = base.v[i][3] > 1.0
-                A[3] += ti.select(pressed, u.dot(slope), ti.max(u.dot(slope), 0.0))
+                A[3] += u.dot(slope)
                 A[3] -= ti.cast(self.velocity[b].dot(film) + self.spin[b].dot(twist), ti.f32)
                 F += ti.max(base.x[i][3], 0.0) * film
                 T += ti.max(base.x[i][3], 0.0) * twist
                 scheme.rate[i] = A
                 if ti.static(base.structure.shifting):
-                    scheme.crowd[i] += ti.Vector([slope[0], slope[1], slope[2], ti.select(pressed, self.M[m].trace(), 0.0)])
+                    scheme.crowd[i] += ti.Vector([slope[0], slope[1], slope[2], self.M[m].trace()])
                 F -= f
                 T -= self.r[m].cross(f)
             self.force[b], self.torque[b] = F, T
