@@ -450,23 +450,18 @@ class RigidBodies(Bodies):
                 A, slope = scheme.rate[i], lift(self.g[m])
                 u = lift(base.v[i]) - self.there(b, m, self.VELOCITY)
                 f = self.M[m] @ lift(scheme.before[i] - g) - 2.0 * ti.max(base.x[i][3], 0.0) * slope
-                # Nor is the pressure in the body below zero.
-                steep = slope.norm()
-                away = slope / ti.max(steep, 1e-12)
-                f -= ti.max(f.dot(away) + ti.max(base.x[i][3], 0.0) * steep, 0.0) * away
                 if ti.static(self.viscous):
                     f -= nu * self.rub(m, u)
                 for d in ti.static(range(3)):
                     A[d] += f[d]
                 film, twist = self.h[m] - slope, self.l[m] - self.r[m].cross(slope)
-                # As at walls: what leaves the body leaves nothing behind that could hold it, and what presses on nothing is no inner particle.
-                pressed = base.v[i][3] > 1.0
-                A[3] += ti.select(pressed, u.dot(slope), ti.max(u.dot(slope), 0.0)) - ti.cast(self.velocity[b].dot(film) + self.spin[b].dot(twist), ti.f32)
+                A[3] += u.dot(slope)
+                A[3] -= ti.cast(self.velocity[b].dot(film) + self.spin[b].dot(twist), ti.f32)
                 F += ti.max(base.x[i][3], 0.0) * film
                 T += ti.max(base.x[i][3], 0.0) * twist
                 scheme.rate[i] = A
                 if ti.static(base.structure.shifting):
-                    scheme.crowd[i] += ti.Vector([slope[0], slope[1], slope[2], ti.select(pressed, self.M[m].trace(), 0.0)])
+                    scheme.crowd[i] += ti.Vector([slope[0], slope[1], slope[2], self.M[m].trace()])
                 F -= f
                 T -= self.r[m].cross(f)
             self.force[b], self.torque[b] = F, T
@@ -578,13 +573,14 @@ def bare(particles: np.ndarray, bodies: np.ndarray, spacing: float) -> np.ndarra
 
 
 def corner_share(dim: int, spacing: float) -> float:
-    """Share of a uniform pressure that water on a wall pushes with on the lowest BAND spacings of a body's side: there is none below, behind the wall."""
+    """Share of a uniform pressure that water on a wall pushes with on the lowest BAND spacings of a body's side: behind the wall there is none."""
     reach = int(1 / spacing) + 1
     across, along, rows = np.arange(reach) + 0.5, np.arange(-reach, reach + 1), np.arange(int(BAND + 0.5))
-    depth, inner, side, z, row = np.meshgrid(across, across, np.arange(-reach, reach + 3) + 0.5, along if dim == 3 else [0], rows + 0.5, indexing="ij")
+    layers = np.arange(-reach, reach + 3)
+    depth, inner, side, z, row = np.meshgrid(across, across, layers + 0.5, along if dim == 3 else [0], rows + 0.5, indexing="ij")
     r = np.sqrt((depth + inner) ** 2 + (side - row) ** 2 + z**2) * spacing
     push = slope(dim, r) * (depth + inner)
-    return float(push[:, :, np.arange(-reach, reach + 3) >= 0].sum() / push.sum())
+    return float(push[:, :, layers >= 0].sum() / push.sum())
 
 
 def lightest(particles: np.ndarray, bodies: np.ndarray, masses: np.ndarray, spacing: float, slopes: float) -> float:
