@@ -16,12 +16,13 @@ from sim.solvers import solver_class
 #: (0.29 s a trajectory): a block runs at 24-30 million, but splashes take more substeps than planned, in frames so short that their ends
 #: show. Goop, elastic and snow in 2D were measured against sand (0.9, 1.25 and 0.7 times), elastic in 3D against water; goop and snow in
 #: 3D are guesses from sand, whose decomposition they share. ``benchmarks/paper_data.py`` sets the estimates beside samples.
+#: SPH: ``benchmarks/sph.py``, a column of water that breaks.
 #: Position-based: BOXBATH as it is (0.7 s a trajectory, 5.5 iterations a substep), dam breaks of 250 to 1000 particles in 2D (10 to 13).
 RATES = {
     (2, "water"): 10e6, (2, "sand"): 12e6, (2, "goop"): 11e6, (2, "elastic"): 15e6, (2, "snow"): 8.5e6, (2, "rigid"): 10e6,
     (3, "water"): 15e6, (3, "sand"): 2.7e6, (3, "goop"): 2.7e6, (3, "elastic"): 9e6, (3, "snow"): 2.7e6, (3, "rigid"): 15e6,
     (2, "pbf"): 0.4e6, (3, "pbf"): 0.8e6,
-    (2, "wcsph"): 3.5e6, (3, "wcsph"): 1.5e6, (2, "dfsph"): 2e6, (3, "dfsph"): 1.2e6,
+    (2, "wcsph"): 8e6, (3, "wcsph"): 2e6, (2, "dfsph"): 3.9e6, (3, "dfsph"): 1.35e6,
 }
 
 #: Scenes drawn to describe a family.
