@@ -27,9 +27,7 @@ resume: setup ## after a kill or a power cut: make resume STUDY=demo continues w
 
 test: setup
 	@$(PY) -m ruff check .
-	@# In two runs: Taichi holds at most 512 sets of fields in a process, and falls over at the next.
-	@$(PY) -m pytest -n 2 --dist loadfile --ignore=tests/physics
-	@$(PY) -m pytest -n 2 --dist loadfile tests/physics
+	@$(PY) -m pytest -n 2 --dist loadfile
 
 validate: setup ## the solvers against formulae and experiments, at three resolutions: docs/validation.md
 	@$(PY) -m sim.validation
