@@ -22,6 +22,7 @@ from sim.mpm.walls import solid, wall
 from sim.obstacles import THINNEST, combine
 from sim.rigid import body_table
 from sim.scene import Particles, Scene
+from sim.signed_distance import between_nodes
 from sim.simulator import Kind, SimulationError, Start
 from sim.taichi_runtime import compiling, start_taichi, ti
 
@@ -317,23 +318,8 @@ class _Kernels:
 
     @ti.func
     def clearance(self, x):
-        """Distance [cells] to the obstacles and unit normal at a place inside the box, multilinear in the nodes' values.
-
-        Between nodes the normals are averaged and stretched to length 1 again; on the middle line of a plate they cancel, and it stays 0.
-        """
-        low = ti.cast(x, ti.i32)
-        f = x - ti.cast(low, ti.f32)
-        normal, distance = ti.Vector.zero(ti.f32, self.dim), 0.0
-        for corner in ti.static(range(2**self.dim)):
-            at, weight = low, 1.0
-            for d in ti.static(range(self.dim)):
-                at[d] += ti.static(corner >> d & 1)
-                weight *= f[d] if ti.static(corner >> d & 1) else 1.0 - f[d]
-            value = self.solids[at]
-            distance += weight * value[self.dim]
-            for d in ti.static(range(self.dim)):
-                normal[d] += weight * value[d]
-        return distance, normal / ti.max(normal.norm(), 1e-6)
+        """Distance [cells] to the obstacles and unit normal at a place inside the box."""
+        return between_nodes(self.solids, x, self.dim)
 
     @ti.func
     def push_out(self, p):

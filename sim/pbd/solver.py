@@ -43,8 +43,9 @@ from sim.mpm.decomposition import finite
 from sim.pbd.rigid import COLUMNS, Bodies, body_table
 from sim.scene import Scene
 from sim.simulator import Kind, SimulationError, Start
-from sim.sph.kernel import ENTRIES, SHARE, SLOPE, constant, kernel, lattice_scale, wall_table
-from sim.sph.neighbours import SKIN, Neighbours
+from sim.sph.kernel import ENTRIES, constant, kernel, lattice_scale, wall_table
+from sim.sph.neighbours import ROOM, SKIN, Neighbours
+from sim.sph.walls import HAIR, Walls
 from sim.taichi_runtime import compiling, start_taichi, ti
 
 #: Relaxation of a Jacobi iteration (Bender & Koschier 2017, section 3.3).
@@ -58,10 +59,6 @@ WARM = 0.5
 MOST_RATIO = 2.0
 #: Steps of a frame at most.
 MOST_STEPS = 10_000
-#: Distance from a wall, in support radii, at which particles are stopped.
-HAIR = 1e-4
-#: Room in the list of pairs, as a multiple of those of a lattice at rest.
-ROOM = 2.5
 
 
 @dataclass(frozen=True)
@@ -80,7 +77,7 @@ def _capacity(particles: int) -> int:
 
 
 @ti.data_oriented
-class _Kernels:
+class _Kernels(Walls):
     """Fields and compiled code for one ``Structure``."""
 
     #: Places in ``number``.
@@ -90,10 +87,9 @@ class _Kernels:
         *range(16), 18)  # fmt: skip
 
     def __init__(self, structure: Structure, capacity: int, cells: int, pairs: int):
-        self.structure, self.capacity, self.dim = structure, capacity, structure.dim
+        super().__init__(structure.dim, (False,) * structure.dim)
+        self.structure, self.capacity = structure, capacity
         self.number = ti.field(ti.f32, self.NUMBERS)
-        self.extent = ti.Vector.field(4, ti.f32, 2)
-        self.table = ti.Vector.field(6, ti.f32, ENTRIES + 2)
         self.x, self.v = (ti.Vector.field(4, ti.f32, capacity) for _ in range(2))  # v[3]: w
         self.shift = ti.Vector.field(4, ti.f32, capacity)  # displacement in the step, of bodies' particles in an iteration; lane 3: k
         self.id, self.body = (ti.field(ti.i32, capacity) for _ in range(2))  # body -1: water
@@ -104,29 +100,12 @@ class _Kernels:
         self.sums = ti.Vector.field(4, ti.f32, capacity)  # sum_j G_ij; lane 3: sum_j w_j |G_ij|^2, then dk
         self.wall = ti.Vector.field(4, ti.f32, capacity)  # the walls' part of G_i; lane 3: density
         self.drift = ti.Vector.field(4, ti.f32, capacity)  # a change of x or v
-        self.neighbours = Neighbours(self.dim, capacity, cells, pairs, (False,) * self.dim)
+        self.neighbours = Neighbours(self.dim, capacity, cells, pairs, self.periodic)
         if structure.bodies:
             self.slot = ti.field(ti.i32, capacity)
             self.bodies = Bodies(self, structure.bodies, capacity)
 
     # -- walls
-    @ti.func
-    def walls(self, x):
-        """Gradient of the share of the kernel that lies in walls, and (lane 3) the share: what each wall leaves, multiplied."""
-        fluid, gradient = 1.0, ti.Vector.zero(ti.f32, 4)
-        for f in ti.static(range(2 * self.dim)):
-            d, side = ti.static(f // 2, f % 2)
-            s = x[d] - self.extent[0][d] if ti.static(side == 0) else self.extent[1][d] - x[d]
-            if s < 1.0:
-                u = ti.max(s, 0.0) * float(ENTRIES)
-                k = ti.cast(u, ti.i32)
-                T = self.table[k] + (u - ti.cast(k, ti.f32)) * (self.table[k + 1] - self.table[k])
-                gradient = (1.0 - T[SHARE]) * gradient
-                gradient[d] += fluid * T[SLOPE] * ti.static(1.0 - 2.0 * side)
-                fluid *= 1.0 - T[SHARE]
-        gradient[3] = 1.0 - fluid
-        return gradient
-
     @ti.func
     def enclose(self, i):
         """Keep a particle inside the walls, as a displacement."""

@@ -255,16 +255,14 @@ class DFSPH:
             if ti.static(not self.structure.full):
                 k = ti.select(s > 0.0, k, 0.0)
             self.pressure[i][which] = k
+        iterations, error = 0, 1e30
         if ti.static(self.structure.full):
             for i in range(n):
                 self.source[i] -= mean / ti.cast(n, ti.f32)
-        iterations, error = 0, 1e30
-        if ti.static(self.structure.full):
             iterations, error = self.conjugate(n, which, tolerance, most)
+            self.accelerate(n, self.pressure, which)
         else:
             iterations, error = self.project(n, which, tolerance, most)
-        if ti.static(self.structure.full):
-            self.accelerate(n, self.pressure, which)
         for i in range(n):
             for d in ti.static(range(self.dim)):
                 base.v[i][d] += self.push[i][d] / dt

@@ -13,6 +13,8 @@ from sim.taichi_runtime import ti
 
 #: Added to the support radius where pairs are listed.
 SKIN = 0.1
+#: Room in the list of pairs, as a multiple of those of a lattice at rest.
+ROOM = 2.5
 #: Cells along a periodic axis: with fewer a pair would be met twice.
 FEWEST = 3
 #: Offsets of the cells after a particle's own, half of those around it; for periodic boxes, whose runs wrap around.

@@ -3,8 +3,8 @@
 Lengths are in support radii of the kernel, densities relative to that at rest, time in seconds. All vectors have four lanes whatever the
 dimension, as in ``sim.mpm.solver``: uniform lanes are what the compiler turns into vector instructions, and 2D and 3D share their code.
 
-Decision: one kernel a frame, on one thread, with the adaptive steps inside. Particles interact with walls through integrals of the kernel over
-half-spaces (``sim.sph.kernel``), so there are no boundary particles to search.
+Decision: one kernel a frame, on one thread, with the adaptive steps inside. Particles interact with walls through a table over the distance
+(``sim.sph.kernel``), so there are no boundary particles to search.
 """
 
 import time
@@ -17,6 +17,7 @@ from sim.mpm.decomposition import finite
 from sim.obstacles import combine
 from sim.rigid import NO_SLIP, body_table
 from sim.scene import Incompressible, Particles, Scene
+from sim.signed_distance import between_nodes
 from sim.simulator import Kind, SimulationError, Start
 from sim.sph.dfsph import DFSPH, VISCOUS_ERROR
 from sim.sph.kernel import (
@@ -34,8 +35,9 @@ from sim.sph.kernel import (
     viscous_scale,
     wall_table,
 )
-from sim.sph.neighbours import FEWEST, SKIN, Neighbours
+from sim.sph.neighbours import FEWEST, ROOM, SKIN, Neighbours
 from sim.sph.rigid import RigidBodies, bare, corner_share, lightest
+from sim.sph.walls import HAIR, Walls
 from sim.sph.wcsph import LARGEST_COURANT, LARGEST_VISCOUS, WCSPH
 from sim.taichi_runtime import compiling, start_taichi, ti
 
@@ -47,10 +49,6 @@ MAX_HALVINGS = 6
 GROWTH = 2.0
 #: Share of the box from which on water counts as filling it, without a free surface.
 FULL = 0.999
-#: Distance from a wall, in support radii, at which particles are stopped.
-HAIR = 1e-4
-#: Room in the list of pairs, as a multiple of those of a lattice at rest.
-ROOM = 2.5
 
 
 @dataclass(frozen=True)
@@ -80,7 +78,7 @@ def _power_of_two(n: int) -> int:
 
 
 @ti.data_oriented
-class _Kernels:
+class _Kernels(Walls):
     """Fields and compiled code for one ``Structure``."""
 
     #: Places in ``number``.
@@ -93,14 +91,13 @@ class _Kernels:
     GRAVITY, CHANGE, SPAN, CAP, FIXED, FLOOR, REPORT = 20, 23, 26, 27, 28, 29, 30
 
     def __init__(self, structure: Structure, capacity: int, cells: int, pairs: int, wet: int, nodes: tuple[int, ...]):
-        self.structure, self.capacity, self.dim, self.periodic = structure, capacity, structure.dim, structure.periodic
+        super().__init__(structure.dim, structure.periodic)
+        self.structure, self.capacity = structure, capacity
         self.number = ti.field(ti.f32, self.NUMBERS)
         self.x, self.v = (ti.Vector.field(4, ti.f32, capacity) for _ in range(2))
         self.id = ti.field(ti.i32, capacity)
-        self.extent = ti.Vector.field(4, ti.f32, 2)
-        self.table = ti.Vector.field(6, ti.f32, ENTRIES + 2)
-        # The walls, and the obstacles as one more.
-        self.faces = 2 * self.dim + structure.obstacles
+        # The obstacles are one more.
+        self.faces += structure.obstacles
         if structure.obstacles:
             self.solids = ti.Vector.field(self.dim + 1, ti.f32, nodes)  # normal and distance [support radii], a spacing apart
         self.slide = ti.Vector.field(4, ti.f32, self.faces)
@@ -114,62 +111,26 @@ class _Kernels:
 
     # -- walls
     @ti.func
-    def look(self, s):
-        """``wall_table`` at a distance s <= 1."""
-        u = ti.max(s, 0.0) * float(ENTRIES)
-        # NaN is any index.
-        k = ti.min(ti.max(ti.cast(u, ti.i32), 0), ENTRIES)
-        f = u - ti.cast(k, ti.f32)
-        return (1.0 - f) * self.table[k] + f * self.table[k + 1]
-
-    @ti.func
     def face(self, x, f: ti.template()):
-        """Distance to a wall and the normal away from it; 2 for one that is not there."""
+        """Distance to a wall, or to the obstacles (the last), and the normal away from it; 2 for one that is not there."""
         s, n = 2.0, ti.Vector.zero(ti.f32, 4)
         if ti.static(f == 2 * self.dim):
             s, n = self.clearance(x)
-        elif ti.static(not self.periodic[f // 2]):
-            if ti.static(f % 2 == 0):
-                s, n[f // 2] = x[f // 2] - self.extent[0][f // 2], 1.0
-            else:
-                s, n[f // 2] = self.extent[1][f // 2] - x[f // 2], -1.0
+        else:
+            s, n = self.wall_face(x, f)
         return s, n
 
     @ti.func
     def clearance(self, x):
-        """Distance to the obstacles and unit normal, multilinear in the nodes' values."""
-        low, f = ti.Vector.zero(ti.i32, self.dim), ti.Vector.zero(ti.f32, self.dim)
+        """Distance to the obstacles and unit normal [support radii]."""
+        u, n = ti.Vector.zero(ti.f32, self.dim), ti.Vector.zero(ti.f32, 4)
         for d in ti.static(range(self.dim)):
-            u = x[d] / self.number[self.SPACING]
-            low[d] = ti.min(ti.max(ti.cast(u, ti.i32), 0), ti.static(self.solids.shape[d] - 2))
-            f[d] = u - ti.cast(low[d], ti.f32)
-        n, s = ti.Vector.zero(ti.f32, 4), 0.0
-        for corner in ti.static(range(2**self.dim)):
-            at, weight = low, 1.0
-            for d in ti.static(range(self.dim)):
-                at[d] += ti.static(corner >> d & 1)
-                weight *= f[d] if ti.static(corner >> d & 1) else 1.0 - f[d]
-            value = self.solids[at]
-            s += weight * value[self.dim]
-            for d in ti.static(range(self.dim)):
-                n[d] += weight * value[d]
-        return s, n / ti.max(n.norm(), 1e-6)
-
-    @ti.func
-    def walls(self, x):
-        """Gradient of the share of the kernel that lies in walls, and (lane 3) the share.
-
-        What is fluid of the kernel is taken as the product of what each wall leaves: exact for one wall, and smooth in corners.
-        """
-        fluid, gradient = 1.0, ti.Vector.zero(ti.f32, 4)
-        for f in ti.static(range(self.faces)):
-            s, n = self.face(x, f)
-            if s < 1.0:
-                T = self.look(s)
-                gradient = (1.0 - T[SHARE]) * gradient + (fluid * T[SLOPE]) * n
-                fluid *= 1.0 - T[SHARE]
-        gradient[3] = 1.0 - fluid
-        return gradient
+            # A hair short of the last node, beyond which there is none.
+            u[d] = ti.min(ti.max(x[d] / self.number[self.SPACING], 0.0), ti.static(self.solids.shape[d] - 1 - 1e-4))
+        s, normal = between_nodes(self.solids, u, self.dim)
+        for d in ti.static(range(self.dim)):
+            n[d] = normal[d]
+        return s, n
 
     @ti.func
     def drag(self, x, u, walls: ti.template()):
