@@ -212,7 +212,11 @@ class WCSPH:
             a[3] = 0.5 * (a[3] + trend)
             move = dt * base.v[i] + (0.5 * dt * dt) * a
             if ti.static(self.structure.shifting):
-                move -= ti.select(self.crowd[i][3] > ti.static(INSIDE * self.dim), shift, 0.0) * self.crowd[i]
+                C = self.crowd[i]
+                push = ti.select(C[3] > ti.static(INSIDE * self.dim), shift, 0.0)
+                C[3] = 0.0
+                move -= push * C
+                base.v[i][3] -= 2.0 * push * C.norm_sqr()
             move[3] = 0.0
             base.x[i] += move
             base.v[i] += dt * a
