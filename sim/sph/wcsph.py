@@ -12,8 +12,11 @@ less than its pressure and sinks.
 At a free surface and in spray there is no tension: the density of particles that are not inside does not fall below that at rest. Two
 lone particles whose pressure was negative pulled each other to pieces.
 
-Shifting moves particles down the gradient of their concentration, by 2 max|u| dt grad C (Sun et al. 2017, eq. 10; u: beyond the mean, so that free
-flight is one), where they are inside.
+Shifting moves particles down the gradient of their concentration C = sum_j V W_ij, by dx = -2 max|u| dt grad C (Sun et al. 2017, eq. 10; u: beyond
+the mean, so that free flight is one), where they are away from the surface: what lacks neighbours on one side alone would be moved there. The
+continuity equation counts what the flow does to the sum over the kernel, a lattice that it stirs up included; shifting evens that out again. It
+changes the density with it, by 2 dx . grad C, dx . grad C for the particle and as much for its neighbours together (as the terms in dx of Sun et
+al. 2019 come to where the density is even). Without, each round leaves a little: a closed box ended with 6 % too much, under the pressure of it.
 
 Time: velocity Verlet with predicted velocity and density (Springel 2005, section 4.2), one sweep over the pairs a step. The density is predicted with
 the trend of its rate: without, sound of frequency w grew by (w dt)^4 / 4 a step, which density diffusion hid where there was enough of it; with, it
@@ -24,8 +27,9 @@ from sim.mpm.decomposition import finite
 from sim.sph.kernel import NORMAL, SHARE, SLOPE, SPREAD, TANGENT
 from sim.taichi_runtime import ti
 
-#: Particles count as inside the fluid where sum_j V r . grad W exceeds this share of the dimension (Lee et al. 2008: 1.5 of 2).
-INSIDE = 0.75
+#: Particles count as inside the fluid where sum_j V r . grad W exceeds this share of the dimension (Lee et al. 2008: 1.5 of 2); as away from its
+#: surface above the second. On a lattice the outermost layer has 0.6 to 0.75, the next 0.86 to 1, by the support.
+INSIDE, AWAY = 0.75, 0.9
 #: Largest c dt / h, whatever Courant number is asked for, and largest nu dt / h^2 (h = 1/2). On a lattice the fastest sound has w = 1.2 c / h;
 #: roughness of the lattice's own wavelength decays at 42 to 50 nu per support radius squared, beside a sticky wall at 35 to 40 more (its ``DRAG`` at
 #: ``CLOSEST``), which a predicted velocity bears up to a rate of 1 / dt (``sim.stability``: sound_dt, viscosity_dt).
@@ -41,7 +45,8 @@ class WCSPH:
         self.rigid, self.has_rigid = base.rigid, base.has_rigid
         self.rate = ti.Vector.field(4, ti.f32, capacity)  # acceleration; lane 3: rate of the density
         self.before = ti.Vector.field(4, ti.f32, capacity)
-        self.earlier = ti.Vector.field(1, ti.f32, capacity)  # rate of the density a step before
+        # Rate of the density a step before (the last lane); behind what shifting moved by.
+        self.earlier = ti.Vector.field(4 if self.structure.shifting else 1, ti.f32, capacity)
         self.state = [self.rate, self.before, self.earlier]
         if self.structure.shifting:
             self.crowd = ti.Vector.field(4, ti.f32, capacity)  # gradient of the concentration; lane 3: minus the divergence of position
@@ -203,8 +208,8 @@ class WCSPH:
         for i in range(n):
             a = self.rate[i]
             # What the rate of the density will be, if it changes on as it did.
-            trend = 2.0 * a[3] - self.earlier[i][0]
-            self.earlier[i][0] = a[3]
+            trend = 2.0 * a[3] - self.earlier[i][self.earlier.n - 1]
+            self.earlier[i][self.earlier.n - 1] = a[3]
             self.before[i] = ti.Vector([a[0], a[1], a[2], trend])
             if ti.static(self.has_rigid):
                 # Of a start nothing is known: no pressure.
@@ -213,10 +218,11 @@ class WCSPH:
             move = dt * base.v[i] + (0.5 * dt * dt) * a
             if ti.static(self.structure.shifting):
                 C = self.crowd[i]
-                push = ti.select(C[3] > ti.static(INSIDE * self.dim), shift, 0.0)
-                C[3] = 0.0
-                move -= push * C
-                base.v[i][3] -= 2.0 * push * C.norm_sqr()
+                push = -ti.select(C[3] > ti.static(AWAY * self.dim), shift, 0.0) * C
+                move += push
+                base.v[i][3] += push[0] * C[0] + push[1] * C[1] + push[2] * C[2]
+                for d in ti.static(range(3)):
+                    self.earlier[i][d] = push[d]
             move[3] = 0.0
             base.x[i] += move
             base.v[i] += dt * a
@@ -227,10 +233,12 @@ class WCSPH:
             base.v[i] += (0.5 * dt) * (self.rate[i] - self.before[i])
             inside = False
             if ti.static(self.structure.shifting):
-                inside = self.crowd[i][3] > ti.static(INSIDE * self.dim)
+                C, push = self.crowd[i], self.earlier[i]
+                inside = C[3] > ti.static(INSIDE * self.dim)
+                base.v[i][3] += push[0] * C[0] + push[1] * C[1] + push[2] * C[2]
             base.v[i][3] = ti.select(inside, base.v[i][3], ti.max(base.v[i][3], 1.0))
             if dt == 0.0:
-                self.earlier[i][0] = self.rate[i][3]
+                self.earlier[i][self.earlier.n - 1] = self.rate[i][3]
         if ti.static(self.has_rigid):
             self.rigid.correct(dt)
         return 0

@@ -1,8 +1,10 @@
 """Taylor-Green vortices: in a periodic box their kinetic energy decays as exp(-16 pi^2 t / Re)."""
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from sim.solvers import solver_class
+from sim.sph.kernel import kernel, lattice_scale
 from sim.validation import Curve, Outcome, scene, timed
 
 NUMBER = 7
@@ -35,6 +37,12 @@ def run(resolution: int, method: str) -> Outcome:
     solver.load(what)
     x, y = 2 * np.pi * what.particles().position.T
     velocity = np.stack([-np.cos(x) * np.sin(y), np.sin(x) * np.cos(y)], 1)
+    if method == "wcsph":
+        # Shifting evens the lattice out and takes what the sum over the kernel loses by it from the density, which is to end at one.
+        support, tree = what.solver.support * what.spacing, cKDTree(what.particles().position, boxsize=1.0)
+        near = tree.sparse_distance_matrix(tree, support, output_type="coo_matrix").data / support
+        uneven = kernel(2, near).sum() * lattice_scale(2, 1 / what.solver.support) / what.solver.support**2 / len(x)
+        solver.inject("density", np.arange(len(x)), uneven)
     solver.set_velocity(velocity)
     energy, seconds = timed(solver.frame, FRAMES, lambda _: solver.diagnostics()["kinetic_energy"])
     ours, t = np.array(energy) / ((velocity**2).sum() / 2 * what.spacing**2), what.frame_step * np.arange(1, FRAMES + 1)

@@ -7,7 +7,8 @@ import pytest
 
 from sim.sph.kernel import lattice_scale, lattice_slope, slope
 from sim.sph.solver import SPHSimulator
-from sim.validation import scene
+from sim.solvers import solver_class
+from sim.validation import dam_impact, scene
 
 
 @pytest.mark.parametrize("dim", [2, 3])
@@ -91,3 +92,37 @@ def test_viscosity_limits_the_step():
     solver.frame()
     along, across = solver.state()["velocity"].T
     assert 0.3 < along.max() < 1.25 and np.abs(across).max() < 0.01
+
+
+@pytest.mark.physics
+def test_a_closed_box_keeps_its_density():
+    """Shifting evens out what the flow stirs up, again and again: under a moving lid the mean density stays what the box holds."""
+    what = scene("cavity", {"model": "water", "sound_speed": 10.0, "density": 1.0, "viscosity": 0.01},
+                 [{"kind": "box", "lower": [0.0, 0.0], "upper": [1.0, 1.0]}], [[0.0, 1.0]] * 2, [8, 8], 0.1,
+                 walls={"friction": "sticky", "velocity": {"y+": [1.0, 0.0]}}, solver={"method": "wcsph", "artificial_viscosity": 0.0})  # fmt: skip
+    solver = SPHSimulator()
+    solver.load(what)
+    mean = []
+    for _ in range(100):
+        solver.frame()
+        mean.append(solver.state()["density"].mean() - 1)
+    assert np.abs(mean).max() <= 0.01
+
+
+@pytest.mark.physics
+@pytest.mark.parametrize("method", ["mpm", "wcsph"])
+def test_the_walls_force_is_the_rate_of_change_of_momentum(method):
+    """Until the stream hits the far wall all of its momentum along the tank is the impulse of the wall that the column stood against."""
+    what = dam_impact.tank(16, method)
+    solver = solver_class(method)()
+    solver.load(what)
+    force, momentum = [0.0], 0.0
+    for _ in range(150):
+        solver.frame()
+        state = solver.state()
+        x = state["position"][:, 0]
+        assert x.max() < what.bounds[0][1] - 3 * what.spacing
+        force.append((dam_impact.pressing(x, what) * dam_impact.pressure(solver, method)).sum() * what.spacing**2)
+        momentum = dam_impact.RHO * what.spacing**2 * state["velocity"][:, 0].sum()
+    assert momentum > 100
+    assert np.trapezoid(force, dx=what.frame_step) == pytest.approx(momentum, rel=0.02)
