@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from sim.solvers import solver_class
 from sim.sph.kernel import lattice_scale, lattice_slope, slope
 from sim.sph.solver import SPHSimulator
-from sim.solvers import solver_class
 from sim.validation import dam_impact, scene
 
 
