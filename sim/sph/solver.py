@@ -534,8 +534,9 @@ class SPHSimulator:
         dim, method, particles = scene.dim, scene.solver.method, scene.particles(self._refine(scene))
         _, water = self._water_first(scene, particles)
         n, boxes, pairs, wet, nodes = self._sizes(scene, structure, len(particles.position), len(particles.position) - water)
-        state = {"x": 16, "v": 16} | ({"pressure": 8} if method == "dfsph" else {"rate": 16, "rate before": 16, "density rate before": 4})
-        state |= {"crowd": 16, "shifted by": 12} if structure.shifting else {}
+        state = {"x": 16, "v": 16} | ({"pressure": 8} if method == "dfsph" else {"rate": 16, "rate before": 16})
+        state |= {"crowd": 16, "shift and density rate before": 16} if structure.shifting else {}
+        state |= {"density rate before": 4} if method == "wcsph" and not structure.shifting else {}
         fields = {name: (size, n) for name, size in state.items()} | {f"moved {name}": (size, n) for name, size in state.items()}
         fields |= {f"saved {name}": (size, n) for name, size in state.items()} | {f"{name}id": (4, n) for name in ("", "moved ", "saved ")}
         fields |= {"cell": (4, n), "sorted place": (4, n), "first pair": (4, n + 1), "place when listed": (16, n), "pairs": (4, pairs),

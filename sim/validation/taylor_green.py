@@ -19,8 +19,8 @@ def run(resolution: int, method: str) -> Outcome:
     none else: no artificial one, no XSPH. The rate is that of a line through the logarithm of the energy, until it is down to a fifth.
 
     WCSPH: a support of 3.5 spacings and a lattice jittered by 0.3 of one. A plain lattice shears as a crystal does until it breaks up in a burst
-    of sound that takes a tenth of the energy (50 particles: 9 % too fast with 3.9 spacings); jittered, the decay is 10 % too fast with 2.5
-    spacings, 5 % with 3, 0.6 % with 3.5.
+    of sound that takes a tenth of the energy (50 particles: 13 % too fast); jittered, the decay is 2.3 % too slow with 2.5 spacings, 1.8 % too fast
+    with 3, 0.5 % too slow with 3.5.
 
     DFSPH misses it, from a lattice and with a support of 3 spacings. In a box without a surface its pressures have either sign; where they are
     negative, particles seem to pair: the solver holds densities to their mean, and that rises over the run: by 7 %, with a support

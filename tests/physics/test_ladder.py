@@ -16,8 +16,8 @@ AFFORDABLE = {
     ("cantilever", "mpm"): 4, ("standing_wave", "mpm"): 32, ("dam_break", "mpm"): 16, ("granular_collapse", "mpm"): 8,
     ("block_on_plane", "mpm"): 32, ("elastic_discs", "mpm"): 40, ("viscoplastic_slump", "mpm"): 80,
     ("rotation", "wcsph"): 32, ("rotation", "dfsph"): 32, ("hydrostatics", "wcsph"): 16, ("taylor_green", "wcsph"): 30, ("channel", "dfsph"): 30,
-    ("lid_driven_cavity", "wcsph"): 20, ("standing_wave", "wcsph"): 16, ("elliptical_drop", "dfsph"): 120, ("dam_break", "wcsph"): 8,
-    ("dam_break", "dfsph"): 8,
+    ("lid_driven_cavity", "wcsph"): 20, ("standing_wave", "wcsph"): 16, ("elliptical_drop", "wcsph"): 30, ("elliptical_drop", "dfsph"): 120,
+    ("dam_break", "wcsph"): 8, ("dam_break", "dfsph"): 8,
 }  # fmt: skip
 
 
