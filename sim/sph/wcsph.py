@@ -15,8 +15,9 @@ lone particles whose pressure was negative pulled each other to pieces.
 Shifting moves particles down the gradient of their concentration C = sum_j V W_ij, by dx = -2 max|u| dt grad C (Sun et al. 2017, eq. 10; u: beyond
 the mean, so that free flight is one), where they are away from the surface: what lacks neighbours on one side alone would be moved there. The
 continuity equation counts what the flow does to the sum over the kernel, a lattice that it stirs up included; shifting evens that out again. It
-changes the density with it, by 2 dx . grad C, dx . grad C for the particle and as much for its neighbours together (as the terms in dx of Sun et
-al. 2019 come to where the density is even). Without, each round leaves a little: a closed box ended with 6 % too much, under the pressure of it.
+changes the density with it, by 2 dx . grad C, dx . grad C for the particle and as much for its neighbours together (what the terms in dx of Sun
+et al. 2019 come to where the density is even), with the mean grad C of before and after. Without, each round leaves a little: a closed box ended
+with 6 % too much, under the pressure of it. A jittered lattice that starts at density one ends, evened out, that much below.
 
 Time: velocity Verlet with predicted velocity and density (Springel 2005, section 4.2), one sweep over the pairs a step. The density is predicted with
 the trend of its rate: without, sound of frequency w grew by (w dt)^4 / 4 a step, which density diffusion hid where there was enough of it; with, it
