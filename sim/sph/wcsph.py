@@ -31,6 +31,9 @@ from sim.taichi_runtime import ti
 #: Particles count as inside the fluid where sum_j V r . grad W exceeds this share of the dimension (Lee et al. 2008: 1.5 of 2); as away from its
 #: surface above the second. On a lattice the outermost layer has 0.6 to 0.75, the next 0.86 to 1, by the support.
 INSIDE, AWAY = 0.75, 0.9
+#: Density below which shifting takes none: the 1 % by which weakly compressible water differs from rest. What starts crowded, bodies on top of
+#: each other, has no density to pay for being spread out.
+LEAST = 0.99
 #: Largest c dt / h, whatever Courant number is asked for, and largest nu dt / h^2 (h = 1/2). On a lattice the fastest sound has w = 1.2 c / h;
 #: roughness of the lattice's own wavelength decays at 42 to 50 nu per support radius squared, beside a sticky wall at 35 to 40 more (its ``DRAG`` at
 #: ``CLOSEST``), which a predicted velocity bears up to a rate of 1 / dt (``sim.stability``: sound_dt, viscosity_dt).
@@ -198,6 +201,12 @@ class WCSPH:
             self.rate[i] += change
 
     @ti.func
+    def follow(self, i, push, C):
+        """Half of what shifting a particle does to the density."""
+        rho = self.base.v[i][3]
+        self.base.v[i][3] = ti.max(rho + push[0] * C[0] + push[1] * C[1] + push[2] * C[2], ti.min(rho, LEAST))
+
+    @ti.func
     def step(self, n, dt, g, report: ti.template()):
         """One step; ``rate`` is that of its start, which a step of no length finds. Returns how many solves failed: there are none."""
         base = self.base
@@ -221,7 +230,7 @@ class WCSPH:
                 C = self.crowd[i]
                 push = -ti.select(C[3] > ti.static(AWAY * self.dim), shift, 0.0) * C
                 move += push
-                base.v[i][3] += push[0] * C[0] + push[1] * C[1] + push[2] * C[2]
+                self.follow(i, push, C)
                 for d in ti.static(range(3)):
                     self.earlier[i][d] = push[d]
             move[3] = 0.0
@@ -236,7 +245,7 @@ class WCSPH:
             if ti.static(self.structure.shifting):
                 C, push = self.crowd[i], self.earlier[i]
                 inside = C[3] > ti.static(INSIDE * self.dim)
-                base.v[i][3] += push[0] * C[0] + push[1] * C[1] + push[2] * C[2]
+                self.follow(i, push, C)
             base.v[i][3] = ti.select(inside, base.v[i][3], ti.max(base.v[i][3], 1.0))
             if dt == 0.0:
                 self.earlier[i][self.earlier.n - 1] = self.rate[i][3]
