@@ -57,8 +57,43 @@ def lattice_slope(dim: int, spacing: float) -> float:
     return float(dim / (spacing**dim * lattice_scale(dim, spacing) * slope(dim, r) * r**2).sum())
 
 
+def _neighbours(dim: int, spacing: float) -> np.ndarray:
+    """[n, dim]: differences from a point of a cubic lattice to the others within reach."""
+    reach = int(1 / spacing) + 1
+    axes = np.meshgrid(*[np.arange(-reach, reach + 1) * spacing] * dim, indexing="ij")
+    r = np.stack([axis.ravel() for axis in axes], 1)
+    length = np.linalg.norm(r, axis=1)
+    return r[(length > 0) & (length < 1)]
+
+
+def lattice_shift(dim: int, spacing: float) -> float:
+    """A by which a particle of a lattice may be moved at most, -A sum_j V grad W, lest what is uneven grows: 0.9 over the largest eigenvalue of
+    -sum_j V (1 - cos k . r_j) grad grad W over all waves k. (Twice its inverse is the limit of stability.)"""
+    r = _neighbours(dim, spacing)
+    length = np.linalg.norm(r, axis=1)
+    across, bend = slope(dim, length), 60 * constant(dim) * length * (1 - length) ** 2
+    hessian = bend[:, None, None] * r[:, :, None] * r[:, None, :] / (length**2)[:, None, None] - across[:, None, None] * np.eye(dim)
+    waves = np.stack([axis.ravel() for axis in np.meshgrid(*[np.linspace(0, np.pi / spacing, 13)] * dim, indexing="ij")], 1)
+    sums = np.einsum("kn,nij->kij", 1 - np.cos(waves @ r.T), hessian) * lattice_scale(dim, spacing) * spacing**dim
+    return float(0.9 / np.linalg.eigvalsh(sums).max())
+
+
+def _stretch(dim: int, spacing: float, s: np.ndarray) -> np.ndarray:
+    """c at distances s [...] to a wall, so that with gradients of pairs times 1 + (c_i + c_j) / 2 along the wall that of a function which is linear
+    along it is exact in every row of a lattice; linear between the rows."""
+    r = _neighbours(dim, spacing)
+    weight = slope(dim, np.linalg.norm(r, axis=1)) * r[:, 1] ** 2
+    row, reach = np.rint(r[:, 0] / spacing).astype(int), int(1 / spacing) + 1
+    share = np.bincount(row + reach, weight / weight.sum(), 2 * reach + 1)
+    rows = np.arange(reach + 1)
+    pairs = np.array([[share[j - i + reach] if abs(j - i) <= reach else 0.0 for j in rows] for i in rows])
+    lost = np.array([share[: reach - i].sum() for i in rows])
+    c = np.linalg.solve(pairs / 2 + np.diag(1 - lost) / 2, lost)
+    return np.interp(s, (rows + 0.5) * spacing, c)
+
+
 #: Columns of ``wall_table``.
-SHARE, SLOPE, NORMAL, TANGENT, DRAG, SPREAD = range(6)
+SHARE, SLOPE, NORMAL, TANGENT, DRAG, SPREAD, STRETCH = range(7)
 
 
 def viscous_weight(r: np.ndarray) -> np.ndarray:
@@ -78,12 +113,12 @@ def viscous_scale(dim: int, spacing: float) -> float:
 
 
 def wall_table(dim: int, spacing: float) -> np.ndarray:
-    """[ENTRIES + 1, 6] float64 over the distance s = 0 .. 1 to a wall: sums over the layers of fluid that stand for it, the planes at
+    """[ENTRIES + 1, 7] float64 over the distance s = 0 .. 1 to a wall: sums over the layers of fluid that stand for it, the planes at
     z = s + spacing / 2, s + 3 spacing / 2, ... behind the particle's own (t: along the wall; q = -W' / r; the kernel is scaled by ``lattice_scale``):
 
     SHARE G = sum W; SLOPE G'; NORMAL sum q z^2 and TANGENT sum q t^2 (of one axis), first moments of the gradient, which over all space are 1; DRAG
     A sum f (t / r)^2 z, what viscosity takes from a particle by a wall whose velocity continues the fluid's linearly (Takeda et al.
-    1994), times s over its velocity; SPREAD sum q r^2, the wall's part in the divergence of position.
+    1994), times s over its velocity; SPREAD sum q r^2, the wall's part in the divergence of position; STRETCH: see ``_stretch``.
     """
     s = np.linspace(0, 1, ENTRIES + 1)[:, None, None]
     z = np.minimum(s + spacing * (np.arange(int(1 / spacing) + 1) + 0.5)[:, None], 1.0)
@@ -97,4 +132,5 @@ def wall_table(dim: int, spacing: float) -> np.ndarray:
     q, along = scale * slope(dim, r), t**2 / (dim - 1)
     drag = viscous_scale(dim, spacing) / spacing**dim * viscous_weight(r) * along * z / np.maximum(r, 1e-30) ** 2
     sums = (scale * kernel(dim, r), -q * z, q * z**2, q * along, drag, q * r**2)
-    return np.stack([(f * area).sum((1, 2)) for f in sums], 1)
+    columns = [(f * area).sum((1, 2)) for f in sums]
+    return np.stack([*columns, _stretch(dim, spacing, s.ravel())], 1)

@@ -12,14 +12,14 @@ Decisions:
 - Volumes. Akinci et al. give boundary particles 1 / sum_p W, for bodies sampled by one layer on their surface. Ours are filled, and the lattice
   goes on across a face: V = spacing^dim is right for water on it, while 1 / sum_p W makes the outermost layer larger,
   so that water stays further away and the body displaces more than it is.
-- Pressure. DFSPH: a_i = -k_i g_i, the transpose of the rate of the density, as at walls (``sim.sph.dfsph``; Akinci et al. 2012, eq. 9): the solves
-  then are projections of the velocities of water *and bodies*, and buoyancy is the water's weight by virtual work. WCSPH: pressures are known, not
-  solved for, and continue across the face by their own gradient (Adami et al. 2012, in its place gravity): p_p = p_i + grad p . (x_p - x_i).
-- Strong coupling. Each iteration of DFSPH's solves includes the motion that its pressures give to the bodies: the operator gains h_i . h_j / m,
-  of rank 3 (2D) or 6 a body, far larger than its diagonal where bodies are light, and Jacobi's iterations diverge. They are preconditioned by it:
-  with B = (h_i; l_i), g and its torque and the films' part, D the diagonal and R^-1 a body's mass and inertia, (D + B R B^T)^-1 costs a solve of
-  6 x 6 a body (Woodbury 1950), over the particles that press or are about to. Gissler et al. (2019), who interlink
-  solves of water and contacts, relax instead.
+- Pressure. DFSPH: a_i = -2 k_i g_i, half of it the transpose of the rate of the density, as at walls (``sim.sph.dfsph``; Akinci et al. 2012, eq. 9,
+  without the mirrored half): its velocity solve then is a projection of the velocities of water *and bodies*, and buoyancy is the water's weight by
+  virtual work. WCSPH: pressures are known, not solved for, and continue across the face by their own gradient (Adami et al. 2012, in its place
+  gravity): p_p = p_i + grad p . (x_p - x_i).
+- Strong coupling. Each iteration of DFSPH's velocity solve includes the motion that its pressures give to the bodies: the operator gains
+  h_i . h_j / m, of rank 3 (2D) or 6 a body, far larger than its diagonal where bodies are light. Conjugate gradients take an iteration for each
+  of its few eigenvalues; Jacobi's iterations diverge, and Gissler et al. (2019), who interlink solves of water and contacts, relax. What
+  corrects places alone leaves bodies where they are.
 - Films. Between a wall and a face nearer than a particle is thick no water fits, and without any a light body would stay on the floor for ever.
   A gap that opens draws water from its rim: the rate of the density of water there loses the film's area times the body's speed away from
   the wall, and by the transpose the rim's pressure acts on that area (``film``); where the rim is dry, by as much less. Between bodies there are
@@ -70,7 +70,7 @@ class RigidBodies(Bodies):
         self.first, self.other = ti.field(ti.i32, base.capacity + 1), ti.field(ti.i32, pairs)  # pairs of body particles with water's
         self.entry = ti.field(ti.i32, base.capacity)  # a water particle's with the body that ``gather`` is at
         self.begin = ti.field(ti.i32, bodies + 1)  # a body's entries
-        self.particle, self.count_near = ti.field(ti.i32, pairs), ti.field(ti.i32, pairs)
+        self.particle = ti.field(ti.i32, pairs)
         self.g = ti.Vector.field(4, ti.f32, pairs)  # and S
         self.r = ti.Vector.field(3, ti.f32, pairs)  # x_i - c
         self.h, self.l = (ti.Vector.field(3, ti.f32, pairs) for _ in range(2))  # force and torque on the body by a pressure of 1
@@ -78,6 +78,8 @@ class RigidBodies(Bodies):
         self.rim = ti.Vector.field(3, ti.f32, pairs)
         if self.weak:
             self.M = ti.Matrix.field(3, 3, ti.f32, pairs)
+        else:
+            self.spread = ti.field(ti.f32, pairs)  # the trace of M
         if self.viscous:
             self.K = ti.field(ti.f32, pairs)
             self.face = ti.Vector.field(4, ti.f32, pairs)  # the nearest face's normal and distance
@@ -98,10 +100,10 @@ class RigidBodies(Bodies):
         """As ``SPHSimulator.plan`` lists them."""
         found = Bodies.sizes(dim, bodies, planes, particles, particles)
         found |= {"rigid first": (4, particles + 1), "rigid entry": (4, particles)}
-        found |= {f"rigid {name}": (4, pairs) for name in ("other", "particle", "near")}
+        found |= {f"rigid {name}": (4, pairs) for name in ("other", "particle")}
         found |= {"rigid begin": (4, bodies + 1), "rigid g": (16, pairs), "rigid r": (12, pairs), "rigid h": (12, pairs), "rigid l": (12, pairs)}
         found |= {"rigid bare": (4, particles), "rigid rim": (12, pairs)}
-        found |= {"rigid M": (36, pairs)} if weak else {}
+        found |= {"rigid M": (36, pairs)} if weak else {"rigid spread": (4, pairs)}
         found |= {"rigid K": (4, pairs), "rigid face": (16, pairs)} if viscous else {}
         vectors = ["force", "force before", "saved force"] if weak else ["pull"] + ["search", "drag", "residual"] * viscous
         return found | {f"rigid {kind} {name}": (24, bodies) for name in vectors for kind in ("linear", "angular")}
@@ -191,10 +193,12 @@ class RigidBodies(Bodies):
                         if m < first:
                             m = e
                             e += 1
-                            self.entry[i], self.particle[m], self.count_near[m] = m, i, 0
+                            self.entry[i], self.particle[m] = m, i
                             self.g[m], self.r[m] = ti.Vector.zero(ti.f32, 4), self.arm(b, lift(base.x[i]))
                             if ti.static(self.weak):
                                 self.M[m] = ti.Matrix.zero(ti.f32, 3, 3)
+                            else:
+                                self.spread[m] = 0.0
                             if ti.static(self.viscous):
                                 self.K[m] = 0.0
                                 s, face = self.outside(b, lift(base.x[i]))
@@ -204,10 +208,11 @@ class RigidBodies(Bodies):
                         G = -q * r
                         G[3] = V * C * t * t * t * t * (5.0 - 4.0 * t)
                         self.g[m] += G
-                        self.count_near[m] += 1
                         way = lift(r)
                         if ti.static(self.weak):
                             self.M[m] += q * way.outer_product(way)
+                        else:
+                            self.spread[m] += q * q2
                         if ti.static(self.viscous):
                             face = self.face[m]
                             # The body's velocity is that of its face, behind which it continues the water's linearly (Takeda et al. 1994).
@@ -216,7 +221,7 @@ class RigidBodies(Bodies):
                             self.K[m] += base.number[base.THICKNESS] * ti.max(z / face[3], 1.0) * t * ti.sqrt(t) * along / (q2 + 1e-12)
             self.begin[b + 1] = e
             for m in range(first, e):
-                self.h[m] = lift(self.g[m])
+                self.h[m] = ti.static(1.0 if self.weak else 2.0) * lift(self.g[m])
                 self.l[m], self.rim[m] = self.r[m].cross(self.h[m]), ti.Vector.zero(ti.f32, 3)
             for f in range(2 * self.dim + ti.static(int(self.obstacles))):
                 self.film(b, f)
@@ -289,7 +294,7 @@ class RigidBodies(Bodies):
                         if t > 0.0:
                             along = lift(r)
                             self.rim[self.entry[i]] += (q * t * t * t) * (along - along.dot(n) * n)
-            share = ti.static(2.0 if self.weak else 1.0) / (base.number[base.CORNER] * sides)
+            share = 2.0 / (base.number[base.CORNER] * sides)
             for m in range(self.begin[b], self.begin[b + 1]):
                 weight = share * self.rim[m].norm()
                 self.h[m] += weight * force
@@ -304,27 +309,29 @@ class RigidBodies(Bodies):
 
     # -- pressures as unknowns (DFSPH)
     @ti.func
-    def surround(self, wall: ti.template(), members: ti.template()):
-        """Add g and S to what walls give (``wall``), neighbours to ``members``."""
+    def surround(self, wall: ti.template(), crowd: ti.template()):
+        """Add g and S to what walls give (``wall``), g and tr M to ``crowd``."""
         for m in range(self.begin[self.count[None]]):
-            wall[self.particle[m]] += self.g[m]
-            members[self.particle[m]] += self.count_near[m]
+            i, g = self.particle[m], self.g[m]
+            wall[i] += g
+            g[3] = self.spread[m]
+            crowd[i] += g
 
     @ti.func
-    def flow(self, push: ti.template(), motion: ti.template()):
-        """Rate of water's density by the bodies' motion: push[3] -= h . V + l . w."""
+    def flow(self, push: ti.template(), motion: ti.template(), factor):
+        """Rate of water's density by the bodies' motion: push[3] -= factor (h . V + l . w)."""
         for b in range(self.count[None]):
             V, w = self.motion[motion][0][b], self.motion[motion][1][b]
             for m in range(self.begin[b], self.begin[b + 1]):
-                push[self.particle[m]][3] -= ti.cast(V.dot(self.h[m]) + w.dot(self.l[m]), ti.f32)
+                push[self.particle[m]][3] -= factor * ti.cast(V.dot(self.h[m]) + w.dot(self.l[m]), ti.f32)
 
     @ti.func
-    def react(self, pressure: ti.template(), which):
-        """Accelerations of the bodies by a lane of ``pressure``: m A = sum k h, I alpha = sum k l."""
+    def react(self, pressure: ti.template(), lane, factor):
+        """Accelerations of the bodies by ``factor`` times a lane of ``pressure``: m A = sum k h, I alpha = sum k l."""
         for b in range(self.count[None]):
             F, T = ti.Vector.zero(ti.f64, 3), ti.Vector.zero(ti.f64, 3)
             for m in range(self.begin[b], self.begin[b + 1]):
-                k = pressure[self.particle[m]][which]
+                k = factor * pressure[self.particle[m]][lane]
                 F += k * self.h[m]
                 T += k * self.l[m]
             self.motion[self.PULL][0][b], self.motion[self.PULL][1][b] = F / self.total(b), self.inverse[b] @ T
@@ -333,33 +340,6 @@ class RigidBodies(Bodies):
     def total(self, b):
         """Mass of a body."""
         return self.mass[b] * ti.cast(self.span[b][1] - self.span[b][0], ti.f32)
-
-    @ti.func
-    def give_way(self, residual: ti.template(), pressure: ti.template(), sums: ti.template(), which):
-        """Precondition the ``residual`` of the particles that press: D (D + B R B^T)^-1 of it, body after body."""
-        for b in range(self.count[None]):
-            A, E, C = ti.Matrix.zero(ti.f64, 3, 3), ti.Matrix.zero(ti.f64, 3, 3), ti.Matrix.zero(ti.f64, 3, 3)
-            F, T = ti.Vector.zero(ti.f64, 3), ti.Vector.zero(ti.f64, 3)
-            for m in range(self.begin[b], self.begin[b + 1]):
-                i = self.particle[m]
-                left = residual[i]
-                if pressure[i][which] > 0.0 or left > 0.0:
-                    alpha, g, turn = sums[i][3], self.h[m], self.l[m]
-                    A += alpha * g.outer_product(g)
-                    E += alpha * g.outer_product(turn)
-                    C += alpha * turn.outer_product(turn)
-                    F += alpha * left * g
-                    T += alpha * left * turn
-            R = rotation(self.turn[b])
-            A += self.total(b) * ti.Matrix.identity(ti.f64, 3)
-            C += R @ self.inertia[b] @ R.transpose()
-            inverse = A.inverse()
-            w = (C - E.transpose() @ inverse @ E).inverse() @ (T - E.transpose() @ inverse @ F)
-            v = inverse @ (F - E @ w)
-            for m in range(self.begin[b], self.begin[b + 1]):
-                i = self.particle[m]
-                if pressure[i][which] > 0.0 or residual[i] > 0.0:
-                    residual[i] -= ti.cast(v.dot(self.h[m]) + w.dot(self.l[m]), ti.f32)
 
     @ti.func
     def accelerate(self, factor):

@@ -15,7 +15,7 @@ import numpy as np
 from sim.errors import InputError
 from sim.mpm.decomposition import finite
 from sim.obstacles import combine
-from sim.rigid import NO_SLIP, body_table
+from sim.rigid import NO_SLIP, body_table, lift
 from sim.scene import Incompressible, Particles, Scene
 from sim.signed_distance import between_nodes
 from sim.simulator import Kind, SimulationError, Start
@@ -31,6 +31,7 @@ from sim.sph.kernel import (
     TANGENT,
     constant,
     lattice_scale,
+    lattice_shift,
     lattice_slope,
     viscous_scale,
     wall_table,
@@ -83,7 +84,7 @@ class _Kernels(Walls):
 
     #: Places in ``number``.
     (COUNT, VOLUME, KERNEL, SPACING, CFL, SOUND, GAMMA, VISCOSITY, ALPHA, DELTA, DENSITY_ERROR, DIVERGENCE_ERROR, ITERATIONS, THICKNESS, XSPH,
-     ROUGH, LIGHT, CORNER, NUMBERS) = range(19)
+     ROUGH, LIGHT, CORNER, SHIFT, NUMBERS) = range(20)
     #: Places in a frame's report. Read from it are gravity, its change since the frame before, the frame's length, the longest step and whether
     #: all are to be so long, and the limit below which the frame ends.
     (STEPS, STEP, SPEED, SOLVED, ERROR, UNSOLVED, KINETIC, POTENTIAL, ELASTIC, DENSEST, BROKEN, FULL, LISTED, THICKENED, VISCOUS, OUTSIDE, LAST,
@@ -174,15 +175,22 @@ class _Kernels(Walls):
 
     @ti.func
     def stir(self, n):
-        """Largest speed beyond the mean velocity: that of shifting, so that water in free flight is not shifted."""
-        mean, fast = ti.Vector.zero(ti.f64, 4), 0.0
+        """Largest speed beyond the rigid motion of all water: that of shifting, so that what flies or turns as one is not shifted."""
+        velocity, centre = ti.Vector.zero(ti.f64, 3), ti.Vector.zero(ti.f64, 3)
         for i in range(n):
-            mean += ti.cast(self.v[i], ti.f64)
-        drift = ti.cast(mean / n, ti.f32)
+            velocity += ti.cast(lift(self.v[i]), ti.f64)
+            centre += ti.cast(lift(self.x[i]), ti.f64)
+        drift, middle, spin = ti.cast(velocity / n, ti.f32), ti.cast(centre / n, ti.f32), ti.Vector.zero(ti.f32, 3)
+        if ti.static(not self.neighbours.wraps):
+            L, I = ti.Vector.zero(ti.f64, 3), ti.Matrix.identity(ti.f64, 3) * 1e-12
+            for i in range(n):
+                r, u = lift(self.x[i]) - middle, lift(self.v[i]) - drift
+                L += ti.cast(r.cross(u), ti.f64)
+                I += ti.cast(r.norm_sqr() * ti.Matrix.identity(ti.f32, 3) - r.outer_product(r), ti.f64)
+            spin = ti.cast(I.inverse() @ L, ti.f32)
+        fast = 0.0
         for i in range(n):
-            u = self.v[i] - drift
-            u[3] = 0.0
-            fast = ti.max(fast, u.norm_sqr())
+            fast = ti.max(fast, (lift(self.v[i]) - drift - spin.cross(lift(self.x[i]) - middle)).norm_sqr())
         return ti.sqrt(fast)
 
     # -- pairs
@@ -312,7 +320,7 @@ class _Kernels(Walls):
                 for f in range(self.faces):
                     self.slide[f][d] = numbers[4 + f, d]
             for k in range(ENTRIES + 2):
-                for c in ti.static(range(6)):
+                for c in ti.static(range(7)):
                     self.table[k][c] = table[ti.min(k, ENTRIES), c]
             n = data.shape[0]
             for i in range(n):
@@ -441,7 +449,7 @@ class SPHSimulator:
         row[k.VISCOSITY], row[k.THICKNESS] = water.viscosity / water.density / support**2, viscous_scale(dim, d)
         if isinstance(solver, Incompressible):
             row[k.DENSITY_ERROR], row[k.DIVERGENCE_ERROR] = (self.settings["tolerance"] * e for e in (solver.density_error, solver.divergence_error))
-            row[k.ITERATIONS], row[k.XSPH] = solver.iterations, solver.xsph
+            row[k.ITERATIONS], row[k.XSPH], row[k.SHIFT] = solver.iterations, solver.xsph, lattice_shift(dim, d)
         else:
             row[k.SOUND] = water.sound_speed * np.sqrt(self.settings["stiffness"]) / support
             # Its density is not a sum: only gradients use the kernel.
@@ -540,11 +548,12 @@ class SPHSimulator:
         fields = {name: (size, n) for name, size in state.items()} | {f"moved {name}": (size, n) for name, size in state.items()}
         fields |= {f"saved {name}": (size, n) for name, size in state.items()} | {f"{name}id": (4, n) for name in ("", "moved ", "saved ")}
         fields |= {"cell": (4, n), "sorted place": (4, n), "first pair": (4, n + 1), "place when listed": (16, n), "pairs": (4, pairs),
-                   "cell starts": (4, boxes + 2), "cell cursors": (4, boxes + 2), "numbers": (4, _Kernels.NUMBERS), "wall table": (24, ENTRIES + 2)}
+                   "cell starts": (4, boxes + 2), "cell cursors": (4, boxes + 2), "numbers": (4, _Kernels.NUMBERS), "wall table": (28, ENTRIES + 2)}
         if method == "dfsph":
-            fields |= {"pairs within reach": (4, pairs), "gradients": (16, pairs), "sums": (16, n), "wall": (16, n), "push": (16, n)}
-            fields |= {"source": (4, n), "members": (4, n), "first within reach": (4, n + 1), "pressure before": (4, n), "pressure after": (4, n)}
-        fields |= {"krylov": (8, n)} if structure.full else {}
+            fields |= {"pairs within reach": (4, pairs), "gradients": (16, pairs), "first within reach": (4, n + 1)}
+            fields |= {name: (16, n) for name in ("sums", "wall", "crowd", "stretch", "push", "move")} | {"alpha": (8, n)}
+            fields |= {name: (4, n) for name in ("active", "source", "pressure search")}
+            fields |= {"slant": (16, n)} if structure.obstacles else {}
         if structure.viscous and method == "dfsph":
             fields |= {"drag": (4, pairs), "residual": (16, n), "search": (16, n), "image": (16, n)}
         fields |= {"rub": (16, n)} if structure.no_slip and method == "wcsph" else {}
@@ -561,7 +570,7 @@ class SPHSimulator:
             "equation of state": "incompressible" if method == "dfsph" else None,
             "pressure solves": "weakly compressible" if method == "wcsph" else None,
             "particle shifting": None if structure.shifting or method == "dfsph" else "shifting: false",
-            "pressure of either sign": None if structure.full or method == "wcsph" else "a free surface", "grid": "particles meet in pairs",
+            "density solve": "no free surface" if structure.full else "weakly compressible" if method == "wcsph" else None, "grid": "particles meet in pairs",
         }
         gravity = float(np.linalg.norm(np.array(scene.gravity) - scene.acceleration(), axis=1).max())
         start = float(np.sqrt((particles.velocity**2).sum(1).max()))
@@ -754,7 +763,7 @@ class SPHSimulator:
             found["density"] = kernels.scheme.wall.to_numpy()[:n, 3][order].astype(float)
             k = kernels.scheme.pressure.to_numpy()[:n][order].astype(float)
             # A kernel of few neighbours finds less than all of a gradient.
-            found["pressure"] = k[:, 1] / lattice_slope(self._scene.dim, self._layout(self._scene)[0] / h) * water.density * h**2
+            found["pressure"] = k[:, 0] / lattice_slope(self._scene.dim, self._layout(self._scene)[0] / h) * water.density * h**2
         order, wet = self._water_first(self._scene, self._scene.particles(self._refine(self._scene)))
         found["density"][order[wet:]] = found["pressure"][order[wet:]] = np.nan
         return found

@@ -14,7 +14,7 @@ class Walls:
     def __init__(self, dim: int, periodic: tuple[bool, ...]):
         self.dim, self.periodic, self.faces = dim, periodic, 2 * dim
         self.extent = ti.Vector.field(4, ti.f32, 2)
-        self.table = ti.Vector.field(6, ti.f32, ENTRIES + 2)
+        self.table = ti.Vector.field(7, ti.f32, ENTRIES + 2)
 
     @ti.func
     def look(self, s):
