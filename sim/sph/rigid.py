@@ -36,7 +36,7 @@ from scipy.linalg import eigh
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from sim.rigid import OVERFLOW, Bodies, lift, rotation
+from sim.rigid import OVERFLOW, Bodies, lift, times
 from sim.sph.kernel import CLOSEST, SHARE, slope
 from sim.sph.neighbours import SKIN
 from sim.taichi_runtime import ti
@@ -225,17 +225,15 @@ class RigidBodies(Bodies):
     @ti.func
     def wall(self, x, f):
         """Distance of a place [4] to wall f, or the obstacles, and its normal [3]."""
-        s, n = OVERFLOW, ti.Vector.zero(ti.f32, 3)
-        for d in ti.static(range(self.dim)):
-            if ti.static(not self.periodic[d]):
-                if f == 2 * d:
-                    s, n[d] = x[d] - self.kernels.extent[0][d], 1.0
-                if f == 2 * d + 1:
-                    s, n[d] = self.kernels.extent[1][d] - x[d], -1.0
-        if ti.static(self.obstacles):
-            far, out, _rough = self.obstacle(x)
-            if f == 2 * self.dim:
-                s, n = far, out
+        s, n, axis, side = OVERFLOW, ti.Vector.zero(ti.f32, 3), f // 2, f % 2
+        if f < 2 * self.dim:
+            n[axis] = 1.0 - 2.0 * side
+            s = (x[axis] - self.kernels.extent[side][axis]) * n[axis]
+            for d in ti.static(range(self.dim)):
+                if ti.static(self.periodic[d]):
+                    s = ti.select(axis == d, OVERFLOW, s)
+        elif ti.static(self.obstacles):
+            s, n, _rough = self.obstacle(x)
         return s, n
 
     @ti.func
@@ -248,48 +246,34 @@ class RigidBodies(Bodies):
         (``corner_share``). The pressures of single particles will not do: those of DFSPH are up to 2.2 times the water's in a corner, and a tenth
         more than the water's bears, half a metre deep, a stone a tenth of a metre high."""
         base, spacing = self.kernels, 2.0 * self.half[None]
-        lowest = OVERFLOW
+        lowest, q = OVERFLOW, 20.0 * base.number[base.KERNEL] * base.number[base.VOLUME]
         for p in range(self.span[b][0], self.span[b][1]):
             lowest = ti.min(lowest, self.wall(base.x[p], f)[0])
-        force, torque, sides = ti.Vector.zero(ti.f32, 3), ti.Vector.zero(ti.f32, 3), 0.0
         if lowest < (THIN + 0.5) * spacing:
-            R = rotation(self.turn[b])
-            for p in range(self.span[b][0], self.span[b][1]):
-                s, n = self.wall(base.x[p], f)
-                if s < lowest + BAND * spacing and self.bare[p] > 0:
-                    area = 0.0
-                    for side in range(2 * self.dim):
-                        if self.bare[p] >> side & 1:
-                            out = ti.Vector([R[0, side // 2], R[1, side // 2], R[2, side // 2]]) * ti.cast(2 * (side % 2) - 1, ti.f32)
-                            area += ti.max(-out.dot(n), 0.0)
-                            sides += (out - out.dot(n) * n).norm()
-                    if s < (THIN + 0.5) * spacing:
-                        filled = 0.0
-                        for k in range(self.first[p], self.first[p + 1]):
-                            r = base.neighbours.apart(base.x[self.other[k]] - base.x[p])
-                            r[3] = 0.0
-                            t = 1.0 - ti.min(r.norm(), 1.0)
-                            if lift(r).dot(n) < -0.5 * spacing:
-                                filled += t * t * t * t * (5.0 - 4.0 * t)
-                        room = base.look(0.5 * spacing)[SHARE] - base.look(ti.min(s, 1.0))[SHARE]
-                        filled *= base.number[base.KERNEL] * base.number[base.VOLUME] / ti.max(room, 1e-6)
-                        area *= 1.0 - ti.min(filled, 1.0)
-                        force += area * n
-                        torque += area * self.arm(b, lift(base.x[p])).cross(n)
-        if sides > 0.0 and force.norm_sqr() > 0.0:
-            q = 20.0 * base.number[base.KERNEL] * base.number[base.VOLUME]
+            R, force, torque, sides = self.rotation[b], ti.Vector.zero(ti.f32, 3), ti.Vector.zero(ti.f32, 3), 0.0
             for p in range(self.span[b][0], self.span[b][1]):
                 s, n = self.wall(base.x[p], f)
                 if s < lowest + BAND * spacing:
+                    area, filled = 0.0, 0.0
+                    for side in range(2 * self.dim):
+                        if self.bare[p] >> side & 1:
+                            out = ti.Vector([R[0, side // 2], R[1, side // 2], R[2, side // 2]]) * ti.cast(2 * (side % 2) - 1, ti.f32)
+                            across = out.dot(n)
+                            area += ti.max(-across, 0.0)
+                            sides += (out - across * n).norm()
                     for k in range(self.first[p], self.first[p + 1]):
                         i = self.other[k]
-                        r = base.neighbours.apart(base.x[i] - base.x[p])
-                        r[3] = 0.0
-                        t = 1.0 - r.norm()
+                        way = lift(base.neighbours.apart(base.x[i] - base.x[p]))
+                        t, across = 1.0 - way.norm(), way.dot(n)
                         if t > 0.0:
-                            along = lift(r)
-                            self.rim[self.entry[i]] += (q * t * t * t) * (along - along.dot(n) * n)
-            share = ti.static(2.0 if self.weak else 1.0) / (base.number[base.CORNER] * sides)
+                            self.rim[self.entry[i]] += (q * t * t * t) * (way - across * n)
+                            filled += ti.select(across < -0.5 * spacing, t * t * t * t * (5.0 - 4.0 * t), 0.0)
+                    if s < (THIN + 0.5) * spacing:
+                        room = base.look(0.5 * spacing)[SHARE] - base.look(ti.min(s, 1.0))[SHARE]
+                        area *= 1.0 - ti.min(filled * base.number[base.KERNEL] * base.number[base.VOLUME] / ti.max(room, 1e-6), 1.0)
+                        force += area * n
+                        torque += area * self.arm(b, lift(base.x[p])).cross(n)
+            share = ti.static(2.0 if self.weak else 1.0) / (base.number[base.CORNER] * ti.max(sides, 1e-6))
             for m in range(self.begin[b], self.begin[b + 1]):
                 weight = share * self.rim[m].norm()
                 self.h[m] += weight * force
@@ -327,35 +311,38 @@ class RigidBodies(Bodies):
                 k = pressure[self.particle[m]][which]
                 F += k * self.h[m]
                 T += k * self.l[m]
-            self.motion[self.PULL][0][b], self.motion[self.PULL][1][b] = F / self.total(b), self.inverse[b] @ T
-
-    @ti.func
-    def total(self, b):
-        """Mass of a body."""
-        return self.mass[b] * ti.cast(self.span[b][1] - self.span[b][0], ti.f32)
+            self.motion[self.PULL][0][b], self.motion[self.PULL][1][b] = F / self.total[b], times(self.inverse[b], T)
 
     @ti.func
     def give_way(self, residual: ti.template(), pressure: ti.template(), sums: ti.template(), which):
         """Precondition the ``residual`` of the particles that press: D (D + B R B^T)^-1 of it, body after body."""
         for b in range(self.count[None]):
-            A, E, C = ti.Matrix.zero(ti.f64, 3, 3), ti.Matrix.zero(ti.f64, 3, 3), ti.Matrix.zero(ti.f64, 3, 3)
-            F, T = ti.Vector.zero(ti.f64, 3), ti.Vector.zero(ti.f64, 3)
+            # R^-1 + B^T D^-1 B, its upper half, and B^T D^-1 residual, on J = (h, l).
+            A, motion = ti.Matrix.zero(ti.f64, 6, 7), ti.Vector.zero(ti.f64, 6)
+            for d in ti.static(range(3)):
+                A[d, d] = ti.cast(self.total[b], ti.f64)
+                for e in ti.static(range(3)):
+                    A[3 + d, 3 + e] = ti.cast(self.moment[b][d, e], ti.f64)
             for m in range(self.begin[b], self.begin[b + 1]):
                 i = self.particle[m]
-                left = residual[i]
+                left, h, l = residual[i], self.h[m], self.l[m]
                 if pressure[i][which] > 0.0 or left > 0.0:
-                    alpha, g, turn = sums[i][3], self.h[m], self.l[m]
-                    A += alpha * g.outer_product(g)
-                    E += alpha * g.outer_product(turn)
-                    C += alpha * turn.outer_product(turn)
-                    F += alpha * left * g
-                    T += alpha * left * turn
-            R = rotation(self.turn[b])
-            A += self.total(b) * ti.Matrix.identity(ti.f64, 3)
-            C += R @ self.inertia[b] @ R.transpose()
-            inverse = A.inverse()
-            w = (C - E.transpose() @ inverse @ E).inverse() @ (T - E.transpose() @ inverse @ F)
-            v = inverse @ (F - E @ w)
+                    J = ti.Vector([h[0], h[1], h[2], l[0], l[1], l[2], left])
+                    for row in range(6):
+                        for column in range(row, 7):
+                            A[row, column] += ti.cast(sums[i][3] * J[row] * J[column], ti.f64)
+            for row in range(6):
+                for below in range(row + 1, 6):
+                    share = A[row, below] / A[row, row]
+                    for column in range(below, 7):
+                        A[below, column] -= share * A[row, column]
+            for up in range(6):
+                row = 5 - up
+                total = A[row, 6]
+                for column in range(row + 1, 6):
+                    total -= A[row, column] * motion[column]
+                motion[row] = total / A[row, row]
+            v, w = ti.Vector([motion[0], motion[1], motion[2]]), ti.Vector([motion[3], motion[4], motion[5]])
             for m in range(self.begin[b], self.begin[b + 1]):
                 i = self.particle[m]
                 if pressure[i][which] > 0.0 or residual[i] > 0.0:
@@ -379,9 +366,8 @@ class RigidBodies(Bodies):
     def drag(self, u: ti.template(), image: ti.template(), dtnu, motion: ti.template()):
         """image_i += dt nu K (u_i - u_b); the opposite, and the body's own momentum m V, I w, in ``force`` and ``torque``."""
         for b in range(self.count[None]):
-            R = rotation(self.turn[b])
-            F = self.total(b) * self.motion[motion][0][b]
-            T = (R @ self.inertia[b] @ R.transpose()) @ self.motion[motion][1][b]
+            F = self.total[b] * self.motion[motion][0][b]
+            T = times(self.moment[b], self.motion[motion][1][b])
             for m in range(self.begin[b], self.begin[b + 1]):
                 i = self.particle[m]
                 f = dtnu * self.rub(m, lift(u[i]) - self.there(b, m, motion))
@@ -397,13 +383,12 @@ class RigidBodies(Bodies):
         R, of the right side and of it."""
         size, error = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
         for b in range(self.count[None]):
-            R = rotation(self.turn[b])
-            P, L = self.total(b) * self.velocity[b], (R @ self.inertia[b] @ R.transpose()) @ self.spin[b]
+            P, L = self.total[b] * self.velocity[b], times(self.moment[b], self.spin[b])
             F, T = P - self.force[b], L - self.torque[b]
             self.residual[0][b], self.residual[1][b] = F, T
-            self.motion[self.SEARCH][0][b], self.motion[self.SEARCH][1][b] = F / self.total(b), self.inverse[b] @ T
+            self.motion[self.SEARCH][0][b], self.motion[self.SEARCH][1][b] = F / self.total[b], times(self.inverse[b], T)
             size += P.dot(self.velocity[b]) + L.dot(self.spin[b])
-            error += F.norm_sqr() / self.total(b) + T.dot(self.inverse[b] @ T)
+            error += F.norm_sqr() / self.total[b] + T.dot(times(self.inverse[b], T))
         return size, error
 
     @ti.func
@@ -423,7 +408,7 @@ class RigidBodies(Bodies):
             self.spin[b] += step * self.motion[self.SEARCH][1][b]
             F, T = self.residual[0][b] - step * self.force[b], self.residual[1][b] - step * self.torque[b]
             self.residual[0][b], self.residual[1][b] = F, T
-            error += F.norm_sqr() / self.total(b) + T.dot(self.inverse[b] @ T)
+            error += F.norm_sqr() / self.total[b] + T.dot(times(self.inverse[b], T))
         return error
 
     @ti.func
@@ -431,8 +416,8 @@ class RigidBodies(Bodies):
         """SEARCH: R times the residual, and ``turn`` of itself."""
         for b in range(self.count[None]):
             linear, angular = self.motion[self.SEARCH][0][b], self.motion[self.SEARCH][1][b]
-            self.motion[self.SEARCH][0][b] = self.residual[0][b] / self.total(b) + turn * linear
-            self.motion[self.SEARCH][1][b] = self.inverse[b] @ self.residual[1][b] + turn * angular
+            self.motion[self.SEARCH][0][b] = self.residual[0][b] / self.total[b] + turn * linear
+            self.motion[self.SEARCH][1][b] = times(self.inverse[b], self.residual[1][b]) + turn * angular
 
     # -- pressures that are known (WCSPH)
     @ti.func
@@ -450,7 +435,7 @@ class RigidBodies(Bodies):
                 i = self.particle[m]
                 A, slope = scheme.rate[i], lift(self.g[m])
                 u = lift(base.v[i]) - self.there(b, m, self.VELOCITY)
-                f = self.M[m] @ lift(scheme.before[i] - g) - 2.0 * ti.max(base.x[i][3], 0.0) * slope
+                f = times(self.M[m], lift(scheme.before[i] - g)) - 2.0 * ti.max(base.x[i][3], 0.0) * slope
                 if ti.static(self.viscous):
                     f -= nu * self.rub(m, u)
                 for d in ti.static(range(3)):
@@ -471,8 +456,8 @@ class RigidBodies(Bodies):
     def kick(self, dt, g):
         """Velocities by ``force``, ``torque`` and gravity over a time dt."""
         for b in range(self.count[None]):
-            self.velocity[b] += dt * (self.force[b] / self.total(b) + lift(g))
-            self.spin[b] += dt * (self.inverse[b] @ self.torque[b])
+            self.velocity[b] += dt * (self.force[b] / self.total[b] + lift(g))
+            self.spin[b] += dt * times(self.inverse[b], self.torque[b])
 
     @ti.func
     def drift(self, dt, g):
@@ -499,8 +484,8 @@ class RigidBodies(Bodies):
     def correct(self, dt):
         """The second half: by what force and torque have changed."""
         for b in range(self.count[None]):
-            self.velocity[b] += (0.5 * dt / self.total(b)) * (self.force[b] - self.before[0][b])
-            self.spin[b] += (0.5 * dt) * (self.inverse[b] @ (self.torque[b] - self.before[1][b]))
+            self.velocity[b] += (0.5 * dt / self.total[b]) * (self.force[b] - self.before[0][b])
+            self.spin[b] += (0.5 * dt) * times(self.inverse[b], self.torque[b] - self.before[1][b])
 
     # -- motion
     @ti.func
@@ -540,11 +525,11 @@ class RigidBodies(Bodies):
                 lack = -ti.max(s, 0.0) / dt - u.dot(n)
                 if lack > 0.0 and s > -1.0:
                     turn = self.arm(b, x).cross(n)
-                    J = ti.cast(lack / (1.0 + 1.0 / self.total(b) + turn.dot(self.inverse[b] @ turn)), ti.f32)
+                    J = ti.cast(lack / (1.0 + 1.0 / self.total[b] + turn.dot(times(self.inverse[b], turn))), ti.f32)
                     for d in ti.static(range(self.dim)):
                         base.v[i][d] += J * n[d]
-                    self.velocity[b] -= J / self.total(b) * n
-                    self.spin[b] -= J * (self.inverse[b] @ turn)
+                    self.velocity[b] -= J / self.total[b] * n
+                    self.spin[b] -= J * times(self.inverse[b], turn)
                 if s < -2.0 * DEEP * self.half[None]:
                     for d in ti.static(range(self.dim)):
                         base.x[i][d] -= s * n[d]
@@ -555,10 +540,9 @@ class RigidBodies(Bodies):
         """Kinetic and potential."""
         kinetic, potential = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
         for b in range(self.count[None]):
-            R = rotation(self.turn[b])
             V, w = self.velocity[b], self.spin[b]
-            kinetic += 0.5 * (self.total(b) * V.norm_sqr() + w.dot((R @ self.inertia[b] @ R.transpose()) @ w))
-            potential -= ti.cast(self.total(b) * self.centre[b].dot(lift(g)), ti.f64)
+            kinetic += 0.5 * (self.total[b] * V.norm_sqr() + w.dot(times(self.moment[b], w)))
+            potential -= ti.cast(self.total[b] * self.centre[b].dot(lift(g)), ti.f64)
         return kinetic, potential
 
 
