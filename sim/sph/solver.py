@@ -336,6 +336,7 @@ class _Kernels(Walls):
                 if ti.static(self.structure.method == "wcsph"):
                     for b in range(self.rigid.count[None]):
                         self.rigid.force[b], self.rigid.torque[b] = ti.Vector.zero(ti.f64, 3), ti.Vector.zero(ti.f64, 3)
+                        self.rigid.felt[b] = ti.Vector.zero(ti.f64, 3)
 
     @ti.kernel
     def load_solids(self, values: ti.types.ndarray(ti.f32, 2)):
@@ -402,6 +403,9 @@ class SPHSimulator:
         bodies = [body for body in scene.bodies if scene.materials[body.material].model == "rigid"]
         faces = max((len(body.vertices) if body.vertices else 6 for body in bodies), default=0)
         rigid = (_power_of_two(len(bodies)), _power_of_two(faces)) if bodies else None
+        if rigid and full:
+            remedy = "with the water they fill the box: without a free surface DFSPH does not converge around bodies; leave room or use wcsph"
+            raise InputError(scene.name, "bodies", len(scene.bodies), remedy)
         return Structure(scene.dim, solver.method, periodic, no_slip, viscous, shifting, xsph, full, bool(scene.obstacles), rigid)
 
     def _refine(self, scene: Scene) -> int:
@@ -732,8 +736,10 @@ class SPHSimulator:
     def _carried(self) -> dict[str, np.ndarray]:
         """What goes from step to step, as in ``state``."""
         kernels, n, dim, h = self._kernels, *self._position.shape, self._support
-        order = np.argsort(kernels.id.to_numpy()[:n])
-        x, v = kernels.x.to_numpy()[:n][order].astype(float), kernels.v.to_numpy()[:n][order].astype(float)
+        order, v = np.argsort(kernels.id.to_numpy()[:n]), kernels.v.to_numpy()[:n].astype(float)
+        for b in range(kernels.rigid.count[None] if kernels.rigid else 0):
+            v[slice(*kernels.rigid.span.to_numpy()[b]), :3] = kernels.rigid.velocities(b)
+        x, v = kernels.x.to_numpy()[:n][order].astype(float), v[order]
         found = {"position": self._lower + x[:, :dim] * h, "velocity": v[:, :dim] * h}
         return found | ({"density": v[:, 3]} if self._scene.solver.method == "wcsph" else {})
 
