@@ -22,15 +22,19 @@ SCENES = ROOT.parent / "configs" / "scenes"
 G, EDGE = 9.81, 0.4
 
 
-def dam(method: str, edge: int, dim: int = 3) -> Scene:
-    """``edge**dim`` particles."""
+def dam(method: str, edge: int, dim: int = 3, body: bool = False) -> Scene:
+    """``edge**dim`` particles; ``body``: and a rigid cube at the far end of the tank."""
     size = [1.2, 1.0, 0.4][:dim]
     cells = [round(length / EDGE * edge) for length in size]
+    water = {"material": "water", "kind": "box", "lower": [0.0] * dim, "upper": [EDGE] * dim, "velocity": [0.0] * dim}
+    cube = water | {"material": "wood", "lower": [1.0, 0.0, 0.1][:dim], "upper": [1.1, 0.1, 0.2][:dim]}
+    materials = {"water": {"model": "water", "sound_speed": 10 * float(np.sqrt(2 * G * EDGE))}}
+    if body:
+        materials["wood"] = {"model": "rigid", "density": 500.0}
     return Scene.from_dict({
         "name": f"{method}-{dim}d-{edge**dim}", "dim": dim, "bounds": [[0.0, count * EDGE / edge] for count in cells],
         "gravity": [0.0, -G, 0.0][:dim], "frame_step": 0.005, "frames": 1000, "radius": 1.5 * EDGE / edge, "cells": cells, "particles_per_cell": 1,
-        "solver": {"method": method}, "materials": {"water": {"model": "water", "sound_speed": 10 * float(np.sqrt(2 * G * EDGE))}}, "seed": 0,
-        "bodies": [{"material": "water", "kind": "box", "lower": [0.0] * dim, "upper": [EDGE] * dim, "velocity": [0.0] * dim}],
+        "solver": {"method": method}, "materials": materials, "seed": 0, "bodies": [water, cube] if body else [water],
     })  # fmt: skip
 
 
@@ -65,10 +69,10 @@ def water_3d() -> Scene:
     return min((family.sample(seed) for seed in range(20)), key=lambda scene: abs(len(scene.particles().position) - 13_000))
 
 
-def _first_call(method: str, dim: int) -> float:
+def _first_call(method: str, dim: int, body: bool) -> float:
     from sim.sph.solver import SPHSimulator
 
-    scene = dam(method, {2: 64, 3: 17}[dim], dim)
+    scene = dam(method, {2: 64, 3: 17}[dim], dim, body)
     begun = time.perf_counter()
     simulator = SPHSimulator()
     simulator.load(scene)
@@ -76,12 +80,12 @@ def _first_call(method: str, dim: int) -> float:
     return time.perf_counter() - begun
 
 
-def first_calls(method: str, dim: int) -> dict:
+def first_calls(method: str, dim: int, body: bool) -> dict:
     """Wall seconds of the first call in a fresh process: kernels compiled, and kernels read from the cache that this leaves."""
     with tempfile.TemporaryDirectory() as folder:
         os.environ["SLUICE_TAICHI_CACHE"] = folder
-        cold, warm = _alone(_first_call, method, dim), _alone(_first_call, method, dim)
-    return {"case": f"first call, {method} {dim}D", "cold_seconds": cold, "warm_seconds": warm}
+        cold, warm = _alone(_first_call, method, dim, body), _alone(_first_call, method, dim, body)
+    return {"case": f"first call, {method} {dim}D{', a rigid body' if body else ''}", "cold_seconds": cold, "warm_seconds": warm}
 
 
 def main() -> None:
@@ -98,7 +102,8 @@ def main() -> None:
     frames = 2 if options.quick else round(options.seconds / 0.005)
     for method in ("wcsph", "dfsph"):
         for dim in (2, 3):
-            show(first_calls(method, dim))
+            for body in (False, True):
+                show(first_calls(method, dim, body))
     for method in ("wcsph", "dfsph"):
         for dim, edge in ((2, 32), (2, 100), (3, 17), (3, 37)):
             show(run(dam(method, 8 if options.quick else edge, dim), frames))

@@ -34,10 +34,7 @@ COLUMNS = 24
 @ti.func
 def lift(v):
     """A vector of 2, 3 or 4 entries as one of 3."""
-    result = ti.Vector.zero(ti.f32, 3)
-    for d in ti.static(range(min(v.n, 3))):
-        result[d] = v[d]
-    return result
+    return ti.Vector([ti.cast(v[d] if ti.static(d < v.n) else 0.0, ti.f32) for d in range(3)])
 
 
 @ti.func
@@ -49,6 +46,30 @@ def rotation(q):
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ])
+
+
+@ti.func
+def times(M, v):
+    """M v of a 3 x 3 matrix. Written out, as the next three: each of Taichi's own products takes 0.05 s to compile, and there were dozens."""
+    return ti.Vector([M[i, 0] * v[0] + M[i, 1] * v[1] + M[i, 2] * v[2] for i in range(3)])
+
+
+@ti.func
+def back(M, v):
+    """M^T v."""
+    return ti.Vector([M[0, i] * v[0] + M[1, i] * v[1] + M[2, i] * v[2] for i in range(3)])
+
+
+@ti.func
+def product(M, N):
+    """M N."""
+    return ti.Matrix([[M[i, 0] * N[0, j] + M[i, 1] * N[1, j] + M[i, 2] * N[2, j] for j in range(3)] for i in range(3)])
+
+
+@ti.func
+def seen(R, M):
+    """R M R^T: a body's tensor in space."""
+    return product(product(R, M), R.transpose())
 
 
 @ti.func
@@ -79,13 +100,14 @@ class Bodies:
         self.count, self.touching = ti.field(ti.i32, ()), ti.field(ti.i32, ())
         self.half = ti.field(ti.f32, ())  # half a particle spacing
         self.span = ti.Vector.field(2, ti.i32, capacity)  # particles span[0] .. span[1]
-        self.mass, self.reach, self.radius = (ti.field(ti.f32, capacity) for _ in range(3))  # of a particle; length; length, 0 without
+        # Of a particle, of the body; length; length, 0 without.
+        self.mass, self.total, self.reach, self.radius = (ti.field(ti.f32, capacity) for _ in range(4))
         self.centre = ti.Vector.field(3, ti.f32, capacity)
         # In float64: a collision adds up hundreds of impulses, which in float32 cost 3e-5 of the momentum.
         self.velocity, self.spin = (ti.Vector.field(3, ti.f64, capacity) for _ in range(2))
         self.turn = ti.Vector.field(4, ti.f32, capacity)
-        self.inertia, self.inverse = ti.Matrix.field(3, 3, ti.f32, capacity), ti.Matrix.field(3, 3, ti.f32, capacity)  # in the body; in space
-        self.rest_inverse = ti.Matrix.field(3, 3, ti.f32, capacity)
+        # Of ``turn``; of inertia and its inverse: in the body, in space.
+        self.rotation, self.inertia, self.rest_inverse, self.moment, self.inverse = (ti.Matrix.field(3, 3, ti.f32, capacity) for _ in range(5))
         self.state = [self.centre, self.velocity, self.spin, self.turn]
         self.saved = [ti.Vector.field(field.n, field.dtype, capacity) for field in self.state]
         self.planes = ti.Vector.field(4, ti.f32, (capacity, planes))  # outward normal, offset from the centre; in the body
@@ -97,8 +119,9 @@ class Bodies:
     @staticmethod
     def sizes(dim: int, bodies: int, planes: int, particles: int, contacts: int) -> dict[str, tuple[int, int]]:
         """Fields with more than a few entries: name -> (bytes an entry, entries), as solvers' ``plan`` lists them."""
-        rigid = {"span": 8, "mass": 4, "reach": 4, "radius": 4, "centre": 12, "velocity": 24, "spin": 24, "turn": 16, "inertia": 36, "inverse": 36,
-                 "rest inverse": 36, "faces": 4, "saved centre": 12, "saved velocity": 24, "saved spin": 24, "saved turn": 16}
+        rigid = {"span": 8, "mass": 4, "total": 4, "reach": 4, "radius": 4, "centre": 12, "velocity": 24, "spin": 24, "turn": 16, "rotation": 36,
+                 "inertia": 36, "rest inverse": 36, "moment": 36, "inverse": 36, "faces": 4, "saved centre": 12, "saved velocity": 24,
+                 "saved spin": 24, "saved turn": 16}  # fmt: skip
         contact = {"pair": 8, "at": 12, "normal": 16, "impulse": 16}
         return ({f"rigid {name}": (size, bodies) for name, size in rigid.items()} | {"rigid planes": (16, bodies * planes)}
                 | {"rigid rest": (4 * dim, particles)} | {f"contact {name}": (size, contacts) for name, size in contact.items()})
@@ -141,6 +164,7 @@ class Bodies:
         for b in range(self.count[None]):
             self.span[b] = ti.Vector([ti.cast(table[b + 1, 0], ti.i32), ti.cast(table[b + 1, 1], ti.i32)])
             self.mass[b], self.reach[b], self.radius[b] = table[b + 1, 2], table[b + 1, 3], table[b + 1, 4]
+            self.total[b] = self.mass[b] * ti.cast(self.span[b][1] - self.span[b][0], ti.f32)
             self.faces[b] = ti.cast(table[b + 1, 5], ti.i32)
             for d in ti.static(range(3)):
                 self.centre[b][d], self.velocity[b][d], self.spin[b][d] = table[b + 1, 6 + d], table[b + 1, 9 + d], 0.0
@@ -148,10 +172,10 @@ class Bodies:
                     self.inertia[b][d, e] = table[b + 1, 12 + 3 * d + e]
             self.rest_inverse[b] = self.inertia[b].inverse()
             self.turn[b] = ti.Vector([1.0, 0.0, 0.0, 0.0])
+            self.rotation[b], self.inverse[b], self.moment[b] = ti.Matrix.identity(ti.f32, 3), self.rest_inverse[b], self.inertia[b]
             for k in range(self.faces[b]):
                 for lane in ti.static(range(4)):
                     self.planes[b, k][lane] = table[b + 1, COLUMNS + 4 * k + lane]
-            self.refresh(b)
             for p in range(self.span[b][0], self.span[b][1]):
                 for d in ti.static(range(self.dim)):
                     self.rest[p][d] = self.kernels.x[p][d] - self.centre[b][d]
@@ -170,9 +194,9 @@ class Bodies:
 
     @ti.func
     def refresh(self, b):
-        """Inverse inertia in space, R I^-1 R^T."""
+        """R; inertia and its inverse in space, R I R^T."""
         R = rotation(self.turn[b])
-        self.inverse[b] = R @ self.rest_inverse[b] @ R.transpose()
+        self.rotation[b], self.inverse[b], self.moment[b] = R, seen(R, self.rest_inverse[b]), seen(R, self.inertia[b])
 
     # -- one step
     @ti.func
@@ -198,29 +222,28 @@ class Bodies:
             for p in range(self.span[b][0], self.span[b][1]):
                 x = self.kernels.x[p]
                 at = lift(x)
-                # A loop at run time, here and elsewhere: every copy of ``touch`` in the code costs a second of compilation.
-                for face in range(2 * self.dim):
-                    axis, side = face // 2, face % 2
-                    inward = ti.Vector.zero(ti.f32, 3)
-                    inward[axis] = 1.0 - 2.0 * side
-                    gap = (x[axis] - ti.cast(self.kernels.extent[side][axis], ti.f32)) * inward[axis] - half
-                    for d in ti.static(range(self.dim)):
-                        if ti.static(self.periodic[d]):
-                            gap = ti.select(axis == d, OVERFLOW, gap)
-                    self.touch(b, -1, at, inward, gap, self.roughness(), dt)
-                if ti.static(self.obstacles):
-                    clear, out, friction = self.obstacle(x)
-                    self.touch(b, -1, at, out, clear - half, friction, dt)
-                for other in range(self.count[None]):
-                    if other != b and self.arm(other, at).norm() < self.reach[other] + half + 1.0:
-                        distance, normal = self.outside(other, at)
-                        self.touch(b, other, at, normal, distance - half, 0.0, dt)
+                # One loop over walls, obstacles and bodies: every copy of ``touch`` in the code costs a second of compilation.
+                for k in range(2 * self.dim + 1 + self.count[None]):
+                    other, gap, normal, friction = k - 2 * self.dim - 1, OVERFLOW, ti.Vector.zero(ti.f32, 3), 0.0
+                    if other < -1:
+                        axis, side = k // 2, k % 2
+                        normal[axis], friction = 1.0 - 2.0 * side, self.roughness()
+                        gap = (x[axis] - ti.cast(self.kernels.extent[side][axis], ti.f32)) * normal[axis]
+                        for d in ti.static(range(self.dim)):
+                            if ti.static(self.periodic[d]):
+                                gap = ti.select(axis == d, OVERFLOW, gap)
+                    elif other == -1:
+                        if ti.static(self.obstacles):
+                            gap, normal, friction = self.obstacle(x)
+                    elif other != b and self.arm(other, at).norm() < self.reach[other] + half + 1.0:
+                        gap, normal = self.outside(other, at)
+                    self.touch(b, ti.max(other, -1), at, normal, gap - half, friction, dt)
 
     @ti.func
     def outside(self, b, at):
         """Distance of a place to a body, negative inside, and the outward normal; beyond an edge that to the farthest of the faces' planes."""
-        R = rotation(self.turn[b])
-        inside = R.transpose() @ self.arm(b, at)
+        R = self.rotation[b]
+        inside = back(R, self.arm(b, at))
         distance, normal = -1e9, ti.Vector([0.0, 1.0, 0.0])
         for k in range(self.faces[b]):
             plane = self.planes[b, k]
@@ -233,7 +256,7 @@ class Bodies:
         if self.radius[b] > 0.0:
             distance = length - self.radius[b]
             normal = radial
-        return distance, R @ normal
+        return distance, times(R, normal)
 
     @ti.func
     def point_velocity(self, b, at):
@@ -252,21 +275,21 @@ class Bodies:
     def softness(self, k, n):
         """Velocity along n that a unit impulse along n brings: sum of 1 / M + (r x n) I^-1 (r x n)."""
         total = 0.0
-        for side in ti.static(range(2)):
+        for side in range(2):
             b = self.pair[k][side]
             if b >= 0:
                 arm = self.arm(b, self.at[k]).cross(n)
-                total += 1.0 / (self.mass[b] * ti.cast(self.span[b][1] - self.span[b][0], ti.f32)) + arm.dot(self.inverse[b] @ arm)
+                total += 1.0 / self.total[b] + arm.dot(times(self.inverse[b], arm))
         return total
 
     @ti.func
     def push(self, k, J):
         """Impulse J on the first body of a contact, -J on the second."""
-        for side in ti.static(range(2)):
-            b, sign = self.pair[k][side], ti.static(1.0 - 2.0 * side)
+        for side in range(2):
+            b, sign = self.pair[k][side], 1.0 - 2.0 * side
             if b >= 0:
-                self.velocity[b] += sign * J / (self.mass[b] * ti.cast(self.span[b][1] - self.span[b][0], ti.f32))
-                self.spin[b] += sign * (self.inverse[b] @ self.arm(b, self.at[k]).cross(J)) / self.unit()
+                self.velocity[b] += sign / self.total[b] * J
+                self.spin[b] += sign / self.unit() * times(self.inverse[b], self.arm(b, self.at[k]).cross(J))
 
     @ti.func
     def solve(self):
@@ -278,26 +301,28 @@ class Bodies:
             for k in range(ti.min(self.touching[None], self.pair.shape[0])):
                 n = ti.Vector([self.normal[k][0], self.normal[k][1], self.normal[k][2]])
                 total = ti.Vector([self.impulse[k][0], self.impulse[k][1], self.impulse[k][2]])
-                pressed = total.dot(n)
-                u = self.slip(k)
-                now = ti.max(pressed + (self.normal[k][3] - u.dot(n)) / self.softness(k, n), 0.0)
-                self.push(k, (now - pressed) * n)
-                held, friction = total - pressed * n, self.impulse[k][3]
-                rubbed = held
-                if friction > 0.0:
-                    w = self.slip(k)
-                    along = w - w.dot(n) * n
+                friction, pressed = self.impulse[k][3], total.dot(n)
+                held, now, moved = total - pressed * n, pressed, 0.0
+                # Along the normal, then along the slip.
+                for part in range(ti.select(friction > 0.0, 2, 1)):
+                    u = self.slip(k)
+                    along, t = u - u.dot(n) * n, n
                     speed = along.norm()
-                    t = along / ti.max(speed, 1e-12)
-                    stuck = held - speed / self.softness(k, t) * t
-                    cone = ti.min(1.0, friction * now / ti.max(stuck.norm(), 1e-30))
-                    for d in ti.static(range(3)):
-                        rubbed[d] = cone * stuck[d]
-                    self.push(k, rubbed - held)
+                    if part == 1:
+                        t = along / ti.max(speed, 1e-12)
+                    J, softness = ti.Vector.zero(ti.f32, 3), self.softness(k, t)
+                    if part == 0:
+                        now = ti.max(pressed + (self.normal[k][3] - u.dot(n)) / softness, 0.0)
+                        J = (now - pressed) * n
+                    else:
+                        stuck = held - speed / softness * t
+                        J = ti.min(1.0, friction * now / ti.max(stuck.norm(), 1e-30)) * stuck - held
+                    self.push(k, J)
+                    total += J
+                    moved += J.norm()
                 for d in ti.static(range(3)):
-                    self.impulse[k][d] = now * n[d] + rubbed[d]
-                change = ti.max(change, ti.abs(now - pressed) + (rubbed - held).norm())
-                largest = ti.max(largest, now)
+                    self.impulse[k][d] = total[d]
+                change, largest = ti.max(change, moved), ti.max(largest, now)
 
     @ti.func
     def move(self, b, dt):
@@ -309,13 +334,14 @@ class Bodies:
             if ti.static(self.periodic[d]):
                 length = ti.cast(self.kernels.extent[1][d] - self.kernels.extent[0][d], ti.f32)
                 self.centre[b][d] -= length * ti.floor(self.centre[b][d] / length)
-        R = rotation(self.turn[b])
-        L = R @ (self.inertia[b] @ (R.transpose() @ self.spin[b]))
-        M = rotation(turned(self.turn[b], 0.5 * dt * self.spin[b]))
-        q = turned(self.turn[b], dt * (M @ (self.rest_inverse[b] @ (M.transpose() @ L))))
-        self.turn[b] = q
+        L, w, q, span = times(self.moment[b], self.spin[b]), self.spin[b], self.turn[b], 0.5 * dt
+        for _half in range(2):
+            q = turned(self.turn[b], span * w)
+            R = rotation(q)
+            w = times(R, times(self.rest_inverse[b], back(R, L)))
+            span = dt
+        self.turn[b], self.spin[b] = q, w
         self.refresh(b)
-        self.spin[b] = self.inverse[b] @ L
 
     @ti.func
     def travel(self, dt):
@@ -332,12 +358,12 @@ class Bodies:
     @ti.func
     def place(self, b, p, R):
         """[3] units of length: where a particle of a body is."""
-        return self.centre[b] + R @ lift(self.rest[p])
+        return self.centre[b] + times(R, lift(self.rest[p]))
 
     @ti.func
     def shift_inside(self, b):
         """Shift a body by what its deepest particles stand in walls and obstacles; thrice, for a corner between slopes."""
-        half, R = self.half[None], rotation(self.turn[b])
+        half, R = self.half[None], self.rotation[b]
         depth, tries = 1.0, 0
         while depth > 1e-4 and tries < 3:
             tries += 1
@@ -365,7 +391,7 @@ class Bodies:
     @ti.func
     def write(self, b):
         """Places and velocities of a body's particles; returns the largest squared speed."""
-        R, fastest = rotation(self.turn[b]), 0.0
+        R, fastest = self.rotation[b], 0.0
         for p in range(self.span[b][0], self.span[b][1]):
             at = self.place(b, p, R)
             v = self.point_velocity(b, at)

@@ -82,9 +82,9 @@ class _Kernels(Walls):
 
     #: Places in ``number``.
     COUNT, VOLUME, KERNEL, SPACING, CFL, ERROR_AT_MOST, ITERATIONS, XSPH, TENSILE, NEAREST, NUMBERS = range(11)
-    #: Places in a frame's report; gravity, the frame's length, the longest step and that before the frame are read from it.
-    (STEPS, STEP, SPEED, SOLVED, ERROR, UNSOLVED, KINETIC, POTENTIAL, DENSEST, BROKEN, FULL, LISTED, LAST, SPAN, CAP, GRAVITY, REPORT) = (
-        *range(16), 18)  # fmt: skip
+    #: Places in a frame's report; gravity, that of the frame before, the frame's length, the longest step and that before the frame are read from it.
+    (STEPS, STEP, SPEED, SOLVED, ERROR, UNSOLVED, KINETIC, POTENTIAL, DENSEST, BROKEN, FULL, LISTED, LAST, SPAN, CAP, GRAVITY, BEFORE, REPORT) = (
+        *range(16), 18, 21)  # fmt: skip
 
     def __init__(self, structure: Structure, capacity: int, cells: int, pairs: int):
         super().__init__(structure.dim, (False,) * structure.dim)
@@ -290,9 +290,9 @@ class _Kernels(Walls):
                     self.drift[j][3] += self.shift[i][3] * self.gradient[k][3]
 
     @ti.func
-    def step(self, n, dt, last, g, report: ti.template()):
-        """``last``: length of the step before, 0 at the start."""
-        kick, ratio = 0.5 * (last + dt) * g, ti.select(last > 0.0, dt / ti.max(last, 1e-12), 0.0)
+    def step(self, n, dt, last, g, before, report: ti.template()):
+        """``last``, ``before``: length of the step before, 0 at the start, and gravity in it."""
+        kick, ratio = 0.5 * (last * before + dt * g), ti.select(last > 0.0, dt / ti.max(last, 1e-12), 0.0)
         if ti.static(self.structure.bodies > 0):
             self.moisten(n)
             pull = ti.select(last > 0.0, dt / ti.max(last * last, 1e-12), 0.0)
@@ -351,9 +351,9 @@ class _Kernels(Walls):
         ti.loop_config(serialize=True)
         for _ in range(1):
             n = ti.cast(self.number[self.COUNT], ti.i32)
-            g = ti.Vector.zero(ti.f32, 4)
+            g, before = ti.Vector.zero(ti.f32, 4), ti.Vector.zero(ti.f32, 4)
             for d in ti.static(range(self.dim)):
-                g[d] = ti.cast(report[self.GRAVITY + d], ti.f32)
+                g[d], before[d] = ti.cast(report[self.GRAVITY + d], ti.f32), ti.cast(report[self.BEFORE + d], ti.f32)
             span, cap, last = ti.cast(report[self.SPAN], ti.f32), ti.cast(report[self.CAP], ti.f32), ti.cast(report[self.LAST], ti.f32)
             left, taken = span, 0
             while left > 1e-6 * span and taken < steps and self.neighbours.count[None] < self.neighbours.other.shape[0]:
@@ -361,10 +361,10 @@ class _Kernels(Walls):
                 dt = ti.min(limit, cap)
                 # Steps divide what is left of the frame.
                 dt = left / ti.max(ti.ceil(left / dt - 1e-4), 1.0)
-                self.step(n, dt, last, g, report)
+                self.step(n, dt, last, g, before, report)
                 left -= dt
                 taken += 1
-                last = dt
+                last, before = dt, g
                 report[self.STEP] = ti.min(report[self.STEP], ti.cast(dt, ti.f64))
                 report[self.SPEED] = ti.max(report[self.SPEED], ti.cast(fast, ti.f64))
             if taken == 0:
@@ -579,6 +579,7 @@ class PBDSimulator:
             self._kernels, self._built = _Kernels(structure, *sizes), (structure, sizes)
         self._scene, self._support, self._tracked = scene, support, particles.tracked
         self._acceleration, self._frame, self._last = scene.acceleration(), 0, 0.0
+        self._pull = self._felt()
         self._mass = self._density(scene) * spacing**dim
         self._position, position = np.zeros((n, dim), np.float32), particles.position
         if self.settings["perturbation"]:
@@ -603,13 +604,17 @@ class PBDSimulator:
         if fresh:
             self.compile_seconds += time.perf_counter() - begun
 
+    def _felt(self) -> np.ndarray:
+        """Gravity as the box feels it in the current frame [length / s^2]."""
+        return np.array(self._scene.gravity) - self._acceleration[min(self._frame, len(self._acceleration) - 1)]
+
     def _run(self, span: float, cap: float, steps: int) -> np.ndarray:
         k, scene = _Kernels, self._scene
         report = np.zeros(k.REPORT)
         report[k.STEP] = report[k.SPAN] = span
         report[k.CAP], report[k.LAST] = cap, self._last
-        felt = np.array(scene.gravity) - self._acceleration[min(self._frame, len(self._acceleration) - 1)]
-        report[k.GRAVITY : k.GRAVITY + scene.dim] = felt / self._support
+        felt = self._felt()
+        report[k.GRAVITY : k.GRAVITY + scene.dim], report[k.BEFORE : k.BEFORE + scene.dim] = felt / self._support, self._pull / self._support
         self._kernels.frame(steps, self._position, report)
         joule = self._mass * self._support**2
         self._diagnostics = {
@@ -621,12 +626,12 @@ class PBDSimulator:
 
     def frame(self) -> np.ndarray:
         """Advance one frame; positions of the recorded particles, [n, dim] float32. Raises ``SimulationError``: the state is then of no use."""
-        k, scene = _Kernels, self._scene
+        k, scene, felt = _Kernels, self._scene, self._felt()
         report = self._run(scene.frame_step, self._fixed(scene) or scene.frame_step / scene.solver.substeps, MOST_STEPS)
         if not np.isfinite(report).all() or report[k.BROKEN] or report[k.UNSOLVED] or report[k.FULL]:
             raise SimulationError(self._why(report))
         self._frame += 1
-        self._last = report[k.LAST]
+        self._last, self._pull = report[k.LAST], felt
         return self._recorded()
 
     def _why(self, report: np.ndarray) -> str:

@@ -465,4 +465,5 @@ class DFSPH:
                 base.enclose(i)
             if ti.static(self.has_rigid):
                 self.rigid.step(dt)
+                self.rigid.put_back()
         return unsolved

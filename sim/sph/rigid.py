@@ -14,8 +14,8 @@ Decisions:
   so that water stays further away and the body displaces more than it is.
 - Pressure. DFSPH: a_i = -2 k_i g_i, half of it the transpose of the rate of the density, as at walls (``sim.sph.dfsph``; Akinci et al. 2012, eq. 9,
   without the mirrored half): its velocity solve then is a projection of the velocities of water *and bodies*, and buoyancy is the water's weight by
-  virtual work. WCSPH: pressures are known, not solved for, and continue across the face by their own gradient (Adami et al. 2012, in its place
-  gravity): p_p = p_i + grad p . (x_p - x_i).
+  virtual work. WCSPH: pressures are known, not solved for, and continue across the face by their mean gradient around the
+  body (Adami et al. 2012: by that of the body's motion): p_p = p_i + grad p . (x_p - x_i).
 - Strong coupling. Each iteration of DFSPH's velocity solve includes the motion that its pressures give to the bodies: the operator gains
   h_i . h_j / m, of rank 3 (2D) or 6 a body, far larger than its diagonal where bodies are light. Conjugate gradients take an iteration for each
   of its few eigenvalues; Jacobi's iterations diverge, and Gissler et al. (2019), who interlink solves of water and contacts, relax. What
@@ -36,7 +36,7 @@ from scipy.linalg import eigh
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from sim.rigid import OVERFLOW, Bodies, lift, rotation
+from sim.rigid import OVERFLOW, Bodies, lift, times
 from sim.sph.kernel import CLOSEST, SHARE, slope
 from sim.sph.neighbours import SKIN
 from sim.taichi_runtime import ti
@@ -47,6 +47,8 @@ DEEP = 0.1
 THIN = 2.0
 #: Height in spacings over its lowest particle of the sides of a body whose pressure a film takes on: three layers.
 BAND = 2.5
+#: Share of a step in the mean acceleration of the water around a body.
+PACE = 0.05
 
 
 def _two(bodies: int) -> list:
@@ -89,8 +91,9 @@ class RigidBodies(Bodies):
             self.force, self.torque = _two(bodies)
         if self.weak:
             self.before = _two(bodies)
-            self.state += [self.force, self.torque]
-            self.saved += _two(bodies)
+            self.felt = ti.Vector.field(3, ti.f64, bodies)  # a - g of the water around a body
+            self.state += [self.force, self.torque, self.felt]
+            self.saved += [ti.Vector.field(3, ti.f64, bodies) for _ in range(3)]
         elif self.viscous:
             self.residual = _two(bodies)
         self.fastest = ti.field(ti.f32, 2)  # squared speed of a body's particle; what it was when the frame began
@@ -106,6 +109,7 @@ class RigidBodies(Bodies):
         found |= {"rigid M": (36, pairs)} if weak else {"rigid spread": (4, pairs)}
         found |= {"rigid K": (4, pairs), "rigid face": (16, pairs)} if viscous else {}
         vectors = ["force", "force before", "saved force"] if weak else ["pull"] + ["search", "drag", "residual"] * viscous
+        found |= {f"rigid {name}": (24, bodies) for name in ("felt", "saved felt")} if weak else {}
         return found | {f"rigid {kind} {name}": (24, bodies) for name in vectors for kind in ("linear", "angular")}
 
     def set_velocity(self, velocity: np.ndarray) -> None:
@@ -121,6 +125,11 @@ class RigidBodies(Bodies):
             angular[b] = np.linalg.pinv(np.trace(second) * np.eye(3) - second) @ np.cross(arm, u).sum(0)
         self.velocity.from_numpy(linear)
         self.spin.from_numpy(angular)
+
+    def velocities(self, b: int) -> np.ndarray:
+        """[n, 3] of body b's particles; those that particles carry are of before the last correction."""
+        arm = self.rest.to_numpy()[slice(*self.span.to_numpy()[b])] @ self.rotation.to_numpy()[b, : self.dim, : self.dim].T
+        return self.velocity.to_numpy()[b] + np.cross(self.spin.to_numpy()[b], np.pad(arm, ((0, 0), (0, 3 - self.dim))))
 
     # -- what ``Bodies`` asks for
     @ti.func
@@ -230,17 +239,15 @@ class RigidBodies(Bodies):
     @ti.func
     def wall(self, x, f):
         """Distance of a place [4] to wall f, or the obstacles, and its normal [3]."""
-        s, n = OVERFLOW, ti.Vector.zero(ti.f32, 3)
-        for d in ti.static(range(self.dim)):
-            if ti.static(not self.periodic[d]):
-                if f == 2 * d:
-                    s, n[d] = x[d] - self.kernels.extent[0][d], 1.0
-                if f == 2 * d + 1:
-                    s, n[d] = self.kernels.extent[1][d] - x[d], -1.0
-        if ti.static(self.obstacles):
-            far, out, _rough = self.obstacle(x)
-            if f == 2 * self.dim:
-                s, n = far, out
+        s, n, axis, side = OVERFLOW, ti.Vector.zero(ti.f32, 3), f // 2, f % 2
+        if f < 2 * self.dim:
+            n[axis] = 1.0 - 2.0 * side
+            s = (x[axis] - self.kernels.extent[side][axis]) * n[axis]
+            for d in ti.static(range(self.dim)):
+                if ti.static(self.periodic[d]):
+                    s = ti.select(axis == d, OVERFLOW, s)
+        elif ti.static(self.obstacles):
+            s, n, _rough = self.obstacle(x)
         return s, n
 
     @ti.func
@@ -253,48 +260,34 @@ class RigidBodies(Bodies):
         (``corner_share``). The pressures of single particles will not do: those of DFSPH are up to 2.2 times the water's in a corner, and a tenth
         more than the water's bears, half a metre deep, a stone a tenth of a metre high."""
         base, spacing = self.kernels, 2.0 * self.half[None]
-        lowest = OVERFLOW
+        lowest, q = OVERFLOW, 20.0 * base.number[base.KERNEL] * base.number[base.VOLUME]
         for p in range(self.span[b][0], self.span[b][1]):
             lowest = ti.min(lowest, self.wall(base.x[p], f)[0])
-        force, torque, sides = ti.Vector.zero(ti.f32, 3), ti.Vector.zero(ti.f32, 3), 0.0
         if lowest < (THIN + 0.5) * spacing:
-            R = rotation(self.turn[b])
-            for p in range(self.span[b][0], self.span[b][1]):
-                s, n = self.wall(base.x[p], f)
-                if s < lowest + BAND * spacing and self.bare[p] > 0:
-                    area = 0.0
-                    for side in range(2 * self.dim):
-                        if self.bare[p] >> side & 1:
-                            out = ti.Vector([R[0, side // 2], R[1, side // 2], R[2, side // 2]]) * ti.cast(2 * (side % 2) - 1, ti.f32)
-                            area += ti.max(-out.dot(n), 0.0)
-                            sides += (out - out.dot(n) * n).norm()
-                    if s < (THIN + 0.5) * spacing:
-                        filled = 0.0
-                        for k in range(self.first[p], self.first[p + 1]):
-                            r = base.neighbours.apart(base.x[self.other[k]] - base.x[p])
-                            r[3] = 0.0
-                            t = 1.0 - ti.min(r.norm(), 1.0)
-                            if lift(r).dot(n) < -0.5 * spacing:
-                                filled += t * t * t * t * (5.0 - 4.0 * t)
-                        room = base.look(0.5 * spacing)[SHARE] - base.look(ti.min(s, 1.0))[SHARE]
-                        filled *= base.number[base.KERNEL] * base.number[base.VOLUME] / ti.max(room, 1e-6)
-                        area *= 1.0 - ti.min(filled, 1.0)
-                        force += area * n
-                        torque += area * self.arm(b, lift(base.x[p])).cross(n)
-        if sides > 0.0 and force.norm_sqr() > 0.0:
-            q = 20.0 * base.number[base.KERNEL] * base.number[base.VOLUME]
+            R, force, torque, sides = self.rotation[b], ti.Vector.zero(ti.f32, 3), ti.Vector.zero(ti.f32, 3), 0.0
             for p in range(self.span[b][0], self.span[b][1]):
                 s, n = self.wall(base.x[p], f)
                 if s < lowest + BAND * spacing:
+                    area, filled = 0.0, 0.0
+                    for side in range(2 * self.dim):
+                        if self.bare[p] >> side & 1:
+                            out = ti.Vector([R[0, side // 2], R[1, side // 2], R[2, side // 2]]) * ti.cast(2 * (side % 2) - 1, ti.f32)
+                            across = out.dot(n)
+                            area += ti.max(-across, 0.0)
+                            sides += (out - across * n).norm()
                     for k in range(self.first[p], self.first[p + 1]):
                         i = self.other[k]
-                        r = base.neighbours.apart(base.x[i] - base.x[p])
-                        r[3] = 0.0
-                        t = 1.0 - r.norm()
+                        way = lift(base.neighbours.apart(base.x[i] - base.x[p]))
+                        t, across = 1.0 - way.norm(), way.dot(n)
                         if t > 0.0:
-                            along = lift(r)
-                            self.rim[self.entry[i]] += (q * t * t * t) * (along - along.dot(n) * n)
-            share = 2.0 / (base.number[base.CORNER] * sides)
+                            self.rim[self.entry[i]] += (q * t * t * t) * (way - across * n)
+                            filled += ti.select(across < -0.5 * spacing, t * t * t * t * (5.0 - 4.0 * t), 0.0)
+                    if s < (THIN + 0.5) * spacing:
+                        room = base.look(0.5 * spacing)[SHARE] - base.look(ti.min(s, 1.0))[SHARE]
+                        area *= 1.0 - ti.min(filled * base.number[base.KERNEL] * base.number[base.VOLUME] / ti.max(room, 1e-6), 1.0)
+                        force += area * n
+                        torque += area * self.arm(b, lift(base.x[p])).cross(n)
+            share = 2.0 / (base.number[base.CORNER] * ti.max(sides, 1e-6))
             for m in range(self.begin[b], self.begin[b + 1]):
                 weight = share * self.rim[m].norm()
                 self.h[m] += weight * force
@@ -334,12 +327,7 @@ class RigidBodies(Bodies):
                 k = factor * pressure[self.particle[m]][lane]
                 F += k * self.h[m]
                 T += k * self.l[m]
-            self.motion[self.PULL][0][b], self.motion[self.PULL][1][b] = F / self.total(b), self.inverse[b] @ T
-
-    @ti.func
-    def total(self, b):
-        """Mass of a body."""
-        return self.mass[b] * ti.cast(self.span[b][1] - self.span[b][0], ti.f32)
+            self.motion[self.PULL][0][b], self.motion[self.PULL][1][b] = F / self.total[b], times(self.inverse[b], T)
 
     @ti.func
     def accelerate(self, factor):
@@ -359,9 +347,8 @@ class RigidBodies(Bodies):
     def drag(self, u: ti.template(), image: ti.template(), dtnu, motion: ti.template()):
         """image_i += dt nu K (u_i - u_b); the opposite, and the body's own momentum m V, I w, in ``force`` and ``torque``."""
         for b in range(self.count[None]):
-            R = rotation(self.turn[b])
-            F = self.total(b) * self.motion[motion][0][b]
-            T = (R @ self.inertia[b] @ R.transpose()) @ self.motion[motion][1][b]
+            F = self.total[b] * self.motion[motion][0][b]
+            T = times(self.moment[b], self.motion[motion][1][b])
             for m in range(self.begin[b], self.begin[b + 1]):
                 i = self.particle[m]
                 f = dtnu * self.rub(m, lift(u[i]) - self.there(b, m, motion))
@@ -377,13 +364,12 @@ class RigidBodies(Bodies):
         R, of the right side and of it."""
         size, error = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
         for b in range(self.count[None]):
-            R = rotation(self.turn[b])
-            P, L = self.total(b) * self.velocity[b], (R @ self.inertia[b] @ R.transpose()) @ self.spin[b]
+            P, L = self.total[b] * self.velocity[b], times(self.moment[b], self.spin[b])
             F, T = P - self.force[b], L - self.torque[b]
             self.residual[0][b], self.residual[1][b] = F, T
-            self.motion[self.SEARCH][0][b], self.motion[self.SEARCH][1][b] = F / self.total(b), self.inverse[b] @ T
+            self.motion[self.SEARCH][0][b], self.motion[self.SEARCH][1][b] = F / self.total[b], times(self.inverse[b], T)
             size += P.dot(self.velocity[b]) + L.dot(self.spin[b])
-            error += F.norm_sqr() / self.total(b) + T.dot(self.inverse[b] @ T)
+            error += F.norm_sqr() / self.total[b] + T.dot(times(self.inverse[b], T))
         return size, error
 
     @ti.func
@@ -403,7 +389,7 @@ class RigidBodies(Bodies):
             self.spin[b] += step * self.motion[self.SEARCH][1][b]
             F, T = self.residual[0][b] - step * self.force[b], self.residual[1][b] - step * self.torque[b]
             self.residual[0][b], self.residual[1][b] = F, T
-            error += F.norm_sqr() / self.total(b) + T.dot(self.inverse[b] @ T)
+            error += F.norm_sqr() / self.total[b] + T.dot(times(self.inverse[b], T))
         return error
 
     @ti.func
@@ -411,26 +397,34 @@ class RigidBodies(Bodies):
         """SEARCH: R times the residual, and ``turn`` of itself."""
         for b in range(self.count[None]):
             linear, angular = self.motion[self.SEARCH][0][b], self.motion[self.SEARCH][1][b]
-            self.motion[self.SEARCH][0][b] = self.residual[0][b] / self.total(b) + turn * linear
-            self.motion[self.SEARCH][1][b] = self.inverse[b] @ self.residual[1][b] + turn * angular
+            self.motion[self.SEARCH][0][b] = self.residual[0][b] / self.total[b] + turn * linear
+            self.motion[self.SEARCH][1][b] = times(self.inverse[b], self.residual[1][b]) + turn * angular
 
     # -- pressures that are known (WCSPH)
     @ti.func
     def press(self, scheme: ti.template(), g):
         """Bodies' part in the rates of water (``sim.sph.wcsph``), and its opposite on them, ``force`` and ``torque``.
 
-        f_i = -2 P_i g_i + M_i (a_i - g): the pressure goes on behind the face by its gradient in the water, g - a_i, as the step before left it
-        (``scheme.before``). Solved for a_i instead, (1 - M)^-1 turns what presses a film of water between a body and the floor into twice as much.
+        f_i = -2 P_i g_i + M_i (a - g): the pressure goes on behind the face by its gradient in the water around the body, g - a, a being the mean
+        acceleration (``scheme.before``) of some ``PACE`` of steps: 0 at rest, g in free fall. By the a_i of each particle and of the step before, a
+        body of a hundredth of water's density gained forty times the energy at hand in a second, whatever the step.
         """
         base = self.kernels
         nu = base.number[base.VISCOSITY]
         for b in range(self.count[None]):
             F, T = ti.Vector.zero(ti.f64, 3), ti.Vector.zero(ti.f64, 3)
+            mean, weight = ti.Vector.zero(ti.f32, 3), 1e-12
+            for m in range(self.begin[b], self.begin[b + 1]):
+                share = self.M[m].trace()
+                mean += share * lift(scheme.before[self.particle[m]] - g)
+                weight += share
+            felt = self.felt[b] + PACE * (ti.cast(mean / weight, ti.f64) - self.felt[b])
+            self.felt[b] = felt
             for m in range(self.begin[b], self.begin[b + 1]):
                 i = self.particle[m]
                 A, slope = scheme.rate[i], lift(self.g[m])
                 u = lift(base.v[i]) - self.there(b, m, self.VELOCITY)
-                f = self.M[m] @ lift(scheme.before[i] - g) - 2.0 * ti.max(base.x[i][3], 0.0) * slope
+                f = times(self.M[m], ti.cast(felt, ti.f32)) - 2.0 * ti.max(base.x[i][3], 0.0) * slope
                 if ti.static(self.viscous):
                     f -= nu * self.rub(m, u)
                 for d in ti.static(range(3)):
@@ -451,8 +445,8 @@ class RigidBodies(Bodies):
     def kick(self, dt, g):
         """Velocities by ``force``, ``torque`` and gravity over a time dt."""
         for b in range(self.count[None]):
-            self.velocity[b] += dt * (self.force[b] / self.total(b) + lift(g))
-            self.spin[b] += dt * (self.inverse[b] @ self.torque[b])
+            self.velocity[b] += dt * (self.force[b] / self.total[b] + lift(g))
+            self.spin[b] += dt * times(self.inverse[b], self.torque[b])
 
     @ti.func
     def drift(self, dt, g):
@@ -461,6 +455,7 @@ class RigidBodies(Bodies):
         Contacts hold both: an impulse at the middle alone would leave half a step's weight on a body at rest."""
         if dt > 0.0:
             self.keep_out(dt)
+            self.put_back()
         for half in range(ti.select(dt > 0.0, 2, 0)):
             if half == 1:
                 self.step(dt)
@@ -479,8 +474,8 @@ class RigidBodies(Bodies):
     def correct(self, dt):
         """The second half: by what force and torque have changed."""
         for b in range(self.count[None]):
-            self.velocity[b] += (0.5 * dt / self.total(b)) * (self.force[b] - self.before[0][b])
-            self.spin[b] += (0.5 * dt) * (self.inverse[b] @ (self.torque[b] - self.before[1][b]))
+            self.velocity[b] += (0.5 * dt / self.total[b]) * (self.force[b] - self.before[0][b])
+            self.spin[b] += (0.5 * dt) * times(self.inverse[b], self.torque[b] - self.before[1][b])
 
     # -- motion
     @ti.func
@@ -509,7 +504,7 @@ class RigidBodies(Bodies):
     @ti.func
     def keep_out(self, dt):
         """Water that a step would take into a body, whatever pressures do, gets no further than its face: u . n >= -distance / dt between the two, by
-        an impulse on both at the water's place. Momenta are kept; what rotation and other impulses leave is put back where it is DEEP."""
+        an impulse on both at the water's place. Momenta are kept."""
         base = self.kernels
         for b in range(self.count[None]):
             for m in range(self.begin[b], self.begin[b + 1]):
@@ -520,11 +515,20 @@ class RigidBodies(Bodies):
                 lack = -ti.max(s, 0.0) / dt - u.dot(n)
                 if lack > 0.0 and s > -1.0:
                     turn = self.arm(b, x).cross(n)
-                    J = ti.cast(lack / (1.0 + 1.0 / self.total(b) + turn.dot(self.inverse[b] @ turn)), ti.f32)
+                    J = ti.cast(lack / (1.0 + 1.0 / self.total[b] + turn.dot(times(self.inverse[b], turn))), ti.f32)
                     for d in ti.static(range(self.dim)):
                         base.v[i][d] += J * n[d]
-                    self.velocity[b] -= J / self.total(b) * n
-                    self.spin[b] -= J * (self.inverse[b] @ turn)
+                    self.velocity[b] -= J / self.total[b] * n
+                    self.spin[b] -= J * times(self.inverse[b], turn)
+
+    @ti.func
+    def put_back(self):
+        """Water that is DEEP in a body, onto its face."""
+        base = self.kernels
+        for b in range(self.count[None]):
+            for m in range(self.begin[b], self.begin[b + 1]):
+                i = self.particle[m]
+                s, n = self.outside(b, lift(base.x[i]))
                 if s < -2.0 * DEEP * self.half[None]:
                     for d in ti.static(range(self.dim)):
                         base.x[i][d] -= s * n[d]
@@ -535,10 +539,9 @@ class RigidBodies(Bodies):
         """Kinetic and potential."""
         kinetic, potential = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
         for b in range(self.count[None]):
-            R = rotation(self.turn[b])
             V, w = self.velocity[b], self.spin[b]
-            kinetic += 0.5 * (self.total(b) * V.norm_sqr() + w.dot((R @ self.inertia[b] @ R.transpose()) @ w))
-            potential -= ti.cast(self.total(b) * self.centre[b].dot(lift(g)), ti.f64)
+            kinetic += 0.5 * (self.total[b] * V.norm_sqr() + w.dot(times(self.moment[b], w)))
+            potential -= ti.cast(self.total[b] * self.centre[b].dot(lift(g)), ti.f64)
         return kinetic, potential
 
 

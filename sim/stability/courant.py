@@ -3,7 +3,7 @@
 import time
 
 from sim.stability import BOUND, Cell
-from sim.stability.driver import SPH, deep, follow, way
+from sim.stability.driver import PBF, SPH, deep, follow, way
 from sim.validation import scene
 
 COURANT = (0.2, 0.4, 0.8, 1.2, 2.0, 2.8, 4.0)
@@ -22,8 +22,8 @@ EXPECTED = "bounded energy, or failed and said so"
 
 def run() -> list[Cell]:
     """Dropped from two cells above a rough floor, in 2D and 3D; energy at hand is what a fall to the floor would release."""
-    return [_drop(name, material, courant, dim) for dim, numbers in ((2, COURANT), (3, COURANT_3D)) for name, material in (MATERIALS | SPH).items()
-            for courant in numbers]
+    return [_drop(name, material, courant, dim) for dim, numbers in ((2, COURANT), (3, COURANT_3D))
+            for name, material in (MATERIALS | SPH | PBF).items() for courant in numbers]
 
 
 def _drop(name: str, material: dict, courant: float, dim: int) -> Cell:

@@ -16,12 +16,13 @@ from sim.stability import Series
 ROUGH = {"friction": 0.5}
 #: Water of the other methods, as a material of ``scene`` by name; SPH has slip walls.
 SPH = {"wcsph": {"model": "water", "sound_speed": 20.0}, "dfsph": {"model": "water"}}
+PBF = {"pbf": {"model": "water"}}
 _solvers: dict[str, Teacher] = {}
 
 
 def way(name: str) -> dict:
-    """What of a scene depends on its method: ``name`` is one of ``SPH``, or a material of MPM, whose walls are ``ROUGH``."""
-    return {"solver": {"method": name}} if name in SPH else {"walls": ROUGH}
+    """What of a scene depends on its method: ``name`` is one of ``SPH`` or ``PBF``, or a material of MPM, whose walls are ``ROUGH``."""
+    return {"solver": {"method": name}} if name in SPH | PBF else {"walls": ROUGH}
 
 
 def deep(what: Scene, low: float, high: float) -> Scene:

@@ -7,19 +7,19 @@ import numpy as np
 from sim.errors import InputError
 from sim.scene import Scene, SceneFamily
 from sim.stability import Cell
-from sim.stability.driver import SPH, deep, follow, solver_for, way
+from sim.stability.driver import PBF, SPH, deep, follow, solver_for, way
 from sim.stability.refusal import FAMILY
 from sim.validation import scene
 
 CELLS, G, FRAME = 16, 9.8, 0.005
-WATER = {"water": {"model": "water", "sound_speed": 20.0}} | SPH
+WATER = {"water": {"model": "water", "sound_speed": 20.0}} | SPH | PBF
 #: Of positions, as 33 cells in float32 round them, some hundred steps.
 ROUNDING = 1e-4
 
 
 def run() -> list[Cell]:
-    """The parabola is exact of velocity Verlet (WCSPH). Of symplectic Euler (MPM, DFSPH) it is that at the steps taken, x0 + v0 t + g t^2 / 2 +
-    g dt t / 2 a frame."""
+    """The parabola is exact of velocity Verlet (WCSPH) and leapfrog (position-based). Of symplectic Euler (MPM, DFSPH) it is that at the steps taken,
+    x0 + v0 t + g t^2 / 2 + g dt t / 2 a frame."""
     film = [{"kind": "box", "lower": [0.25, 0.75], "upper": [0.75, 0.75 + 0.5 / CELLS], "velocity": [0.5, 0.0]}]
     one = [{"kind": "box", "lower": [0.5, 0.5], "upper": [0.5 + 0.5 / CELLS] * 2, "velocity": [0.5, 1.0]}]
     cells = []
@@ -42,7 +42,7 @@ def _flies(cell: str, what: Scene) -> Cell:
     begun = time.perf_counter()
     run, start = follow(what, 50), what.particles()
     exact, velocity, g = start.position.copy(), start.velocity.copy(), np.array(what.gravity)
-    late = 0 if what.solver.method == "wcsph" else 1
+    late = 0 if what.solver.method in ("wcsph", "pbf") else 1
     for n, dt in zip(run.substeps, run.dt, strict=True):
         exact += velocity * n * dt + g * dt**2 * n * (n + late) / 2
         velocity += g * n * dt

@@ -6,12 +6,12 @@ import numpy as np
 
 from sim.scene import Scene
 from sim.stability import Cell
-from sim.stability.driver import SPH, follow, way
+from sim.stability.driver import PBF, SPH, follow, way
 from sim.validation import scene
 
 CELLS, G, FRAME, SHAKE = 16, 9.8, 0.002, 98.0
 #: Five times the speed that the shaken box gives.
-WATER = {"water": {"model": "water", "sound_speed": 20.0}, "wcsph": SPH["wcsph"] | {"sound_speed": 80.0}, "dfsph": SPH["dfsph"]}
+WATER = {"water": {"model": "water", "sound_speed": 20.0}, "wcsph": SPH["wcsph"] | {"sound_speed": 80.0}, "dfsph": SPH["dfsph"]} | PBF
 #: Of positions in float32, as 33 cells in a random walk of some hundred steps round them.
 ROUNDING = 1e-4
 
@@ -34,8 +34,8 @@ def _shake(name: str, of: str) -> list[Cell]:
     begun, what = time.perf_counter(), _shaken(name, [body], 8.0, 90.0, **still)
     run, start = follow(what, 100), what.particles().position
     # The box starts at rest. Its velocity and place follow from the mean accelerations at the steps taken, as symplectic Euler adds them up;
-    # velocity Verlet (WCSPH) follows them exactly, whatever its steps.
-    late, taken = (0, [(1, FRAME)] * len(run.dt)) if name == "wcsph" else (1, zip(run.substeps, run.dt, strict=True))
+    # velocity Verlet (WCSPH) and leapfrog (position-based) follow them exactly, whatever their steps.
+    late, taken = (0, [(1, FRAME)] * len(run.dt)) if name in ("wcsph", "pbf") else (1, zip(run.substeps, run.dt, strict=True))
     v, box, fall, w = np.zeros(2), np.zeros(2), np.zeros(2), np.zeros(2)
     for a, (n, dt) in zip(what.acceleration(), taken, strict=False):
         box, v = box + v * n * dt + a * dt**2 * n * (n + late) / 2, v + a * n * dt

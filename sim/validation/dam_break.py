@@ -8,7 +8,7 @@ from sim.solvers import solver_class
 from sim.validation import Curve, Outcome, scene, timed
 
 NUMBER = 12
-METHODS = ("mpm", "wcsph", "dfsph")
+METHODS = ("mpm", "wcsph", "dfsph", "pbf")
 #: Cells along the column's width.
 RESOLUTIONS = (8, 16, 32)
 A, G, FRAME_STEP = 0.1, 9.8, 0.002

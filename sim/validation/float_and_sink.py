@@ -12,7 +12,7 @@ from sim.sph.kernel import kernel, lattice_scale
 from sim.validation import Curve, Outcome
 
 NUMBER = 16
-METHODS = ("mpm", "wcsph", "dfsph")
+METHODS = ("mpm", "wcsph", "dfsph", "pbf")
 #: Cells along the pool; the box is a quarter of it long.
 RESOLUTIONS = (16, 32, 64)
 WIDTH, HEIGHT, DEPTH = 0.25, 0.125, 0.5
@@ -44,7 +44,7 @@ def run(resolution: int, method: str) -> Outcome:
     if method != "mpm":
         starts = [round(start / spacing) * spacing for start in starts]
     found = [float_and_sink(ratio, start, resolution, method=method, simulator=solver) for ratio, start in zip(RATIOS, starts, strict=True)]
-    density = 1.0 if method == "dfsph" else (1 + 7 * 9.8 * (DEPTH / 2) / SOUND_SPEED**2) ** (1 / 7)
+    density = 1.0 if method in ("dfsph", "pbf") else (1 + 7 * 9.8 * (DEPTH / 2) / SOUND_SPEED**2) ** (1 / 7)
     neutral = float_and_sink(density, (DEPTH - HEIGHT) / 2, resolution, method=method, simulator=solver)
     ours, error = np.array([each["ours"] for each in found]), max(each["error"] for each in found)
     drift = neutral["drift"] / HEIGHT

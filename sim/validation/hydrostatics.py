@@ -8,7 +8,7 @@ from sim.solvers import solver_class
 from sim.validation import Curve, Outcome, l2, scene, timed
 
 NUMBER = 3
-METHODS = ("mpm", "wcsph", "dfsph")
+METHODS = ("mpm", "wcsph", "dfsph", "pbf")
 #: Cells along the box; the water is half as deep.
 RESOLUTIONS = (16, 32, 64)
 H, C, RHO, G = 0.5, 40.0, 1000.0, 9.8
@@ -19,9 +19,13 @@ def run(resolution: int, method: str) -> Outcome:
     """Water over the full width of a unit box. It starts at reference density and rings at 4 H / c, ten frames: means over ten periods after
     the first ten, of the particles of a layer of cells, as MPM's forces come from the grid. The same on the plane surface of an obstacle, which
     lies a quarter, half and three quarters of a cell above a line of nodes: the worst of the three. DFSPH has no c and does not ring, but its
-    particles never come to rest; it gets the same time."""
+    particles never come to rest; it gets the same time. The position-based solver has neither: its surface and rest alone, as its multipliers are
+    no measure of pressure and it knows no obstacles; 64 layers deep its Jacobi iterations, which reach a particle each, do not end in 1000."""
     solver = solver_class(method)()
     curves, seconds, particles = _pool(resolution, method, solver)
+    if method == "pbf":
+        del curves["pressure"]
+        return Outcome("hydrostatics", resolution, particles, curves, seconds)
     worst = max((_pool(resolution, method, solver, offset) for offset in OFFSETS), key=lambda found: found[0]["pressure"].error)
     curves["over an obstacle"] = replace(worst[0]["pressure"], label="relative L2 error of the pressure over an obstacle")
     return Outcome("hydrostatics", resolution, particles, curves, seconds + 3 * worst[1])
@@ -40,7 +44,7 @@ def _pool(resolution: int, method: str, solver, offset: float | None = None) -> 
 
     def observe(_):
         state = solver.state()
-        pressure = RHO * C**2 / 7 * (state["stuff.J"] ** -7 - 1) if method == "mpm" else state["pressure"]
+        pressure = RHO * C**2 / 7 * (state["stuff.J"] ** -7 - 1) if method == "mpm" else state.get("pressure", state["density"])
         return pressure, state["position"][:, 1] - floor, solver.diagnostics()["kinetic_energy"]
 
     found, seconds = timed(solver.frame, 200, observe)

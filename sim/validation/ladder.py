@@ -23,8 +23,8 @@ from sim.validation import CASES, Outcome
 
 HEAD = """# Validation
 
-The solvers against formulae and experiments, each case by every method it applies to (`mpm`; `wcsph` and `dfsph`, smoothed particle hydrodynamics)
-and at three resolutions: error, observed order (slope of log error over log resolution; it
+The solvers against formulae and experiments, each case by every method it applies to (`mpm`; `wcsph` and `dfsph`, smoothed particle
+hydrodynamics; `pbf`, position-based) and at three resolutions: error, observed order (slope of log error over log resolution; it
 means nothing once an error is all rounding or all model), wall time of the frames on one core. A case holds when every error at its *finest*
 resolution is within tolerance. Made by `make validate` ({versions}); a case is one small file of `sim/validation/`, and the tests run each
 at a resolution that takes seconds.
@@ -75,7 +75,7 @@ def figure(title: str, found: dict[str, list[Outcome]], path: Path) -> None:
     panels = canvas.subplots(len(names), 2, width_ratios=[1.4, 1], squeeze=False)
     for (left, right), name in zip(panels, names, strict=True):
         times, sizes, last = [], [], None
-        for (method, outcomes), color in zip(found.items(), ("C0", "C1", "C2"), strict=False):
+        for (method, outcomes), color in zip(found.items(), ("C0", "C1", "C2", "C4"), strict=False):
             if name not in outcomes[-1].curves:
                 continue
             curves = [outcome.curves[name] for outcome in outcomes]

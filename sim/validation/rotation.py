@@ -6,7 +6,7 @@ from sim.solvers import solver_class
 from sim.validation import Curve, Outcome, scene, timed
 
 NUMBER = 1
-METHODS = ("mpm", "wcsph", "dfsph")
+METHODS = ("mpm", "wcsph", "dfsph", "pbf")
 #: Cells a metre; the disc's diameter is 0.3 m.
 RESOLUTIONS = (16, 32, 64)
 RADIUS, WIDTH, OMEGA, GRAVITY, START = 0.15, 2.5, 2 * np.pi, np.array([0.0, -9.8]), np.array([0.5, 2.0])
@@ -18,7 +18,7 @@ def disc(resolution: int, method: str, **changes):
     """The disc in a box whose walls nothing reaches. WCSPH without what is no force between two particles or takes pressures to be hydrostatic:
     shifting carries momentum along, and in free fall density diffusion moves a surface by a hundredth of a spacing. DFSPH without XSPH, which acts
     along velocities, not along the line between two particles: it took 0.2 to 0.9 % of the angular momentum."""
-    settings = {"mpm": {}, "wcsph": {"shifting": False, "density_diffusion": 0.0}, "dfsph": {"xsph": 0.0}}
+    settings = {"mpm": {}, "wcsph": {"shifting": False, "density_diffusion": 0.0}, "dfsph": {"xsph": 0.0}, "pbf": {"xsph": 0.0}}
     solver = {"method": method} | settings[method]
     ball = {"kind": "ball", "center": [0.0, 0.0], "radius": RADIUS}
     return scene("rotation", {"model": "water", "sound_speed": 5.0}, [ball], [[-WIDTH / 2, WIDTH / 2]] * 2, [round(WIDTH * resolution)] * 2, FRAME,
@@ -66,7 +66,7 @@ def fall(solver, resolution: int, method: str) -> tuple[np.ndarray, np.ndarray, 
 
     def observe(position):
         nonlocal exact, v
-        ahead = 0.0 if method == "wcsph" else solver.diagnostics()["dt"]
+        ahead = 0.0 if method in ("wcsph", "pbf") else solver.diagnostics()["dt"]
         exact, v = exact + v * FRAME + GRAVITY * FRAME * (FRAME + ahead) / 2, v + GRAVITY * FRAME
         return position[:, 1].mean(), exact[:, 1].mean(), np.abs(position - exact).max()
 

@@ -5,6 +5,7 @@ import pytest
 from scipy.spatial.distance import pdist
 from taichi.lang.impl import get_runtime
 
+from sim.errors import InputError
 from sim.scene import Scene
 from sim.sph.solver import SPHSimulator
 from sim.validation.float_and_sink import HEIGHT, WIDTH, float_and_sink, pool_scene
@@ -258,3 +259,96 @@ def test_a_box_on_the_floor_rises_if_it_is_light(solvers, method, ratio, rises):
     face = last[wood][:, 1].mean() - HEIGHT / 2
     assert face > 0.3 if rises else abs(face) < 1.5 * what.spacing
     assert np.abs(pdist(last[wood]) - pdist(what.particles().position[wood])).max() < 1e-5 * WIDTH
+
+
+def wet_around(lower, upper, low, high):
+    """Rectangles of water that fill [low, high] but for a body in [lower, upper]."""
+    rooms = [(low, [lower[0], high[1]]), ([upper[0], low[1]], high), ([lower[0], low[1]], [upper[0], lower[1]]),
+             ([lower[0], upper[1]], [upper[0], high[1]])]  # fmt: skip
+    return [("water", box(a, b)) for a, b in rooms if a[0] < b[0] and a[1] < b[1]]
+
+
+FLOOR = {"kind": "halfspace", "point": [0.5, 0.25], "normal": [0.0, 1.0]}
+
+
+@pytest.mark.physics
+@pytest.mark.parametrize("method", METHODS)
+def test_boxes_over_an_obstacle(method):
+    """Its plane surface is a floor like that of the box: half as dense as water a box stays at its draft, to half a spacing; twice as dense it
+    comes to lie there, or on one layer of water."""
+    solver = SPHSimulator()
+    for density, lower in ((500.0, 0.5625), (2000.0, 0.5)):
+        corners = [0.375, lower], [0.625, lower + 0.125]
+        bodies = [*wet_around(*corners, [0.0, 0.25], [1.0, 0.625]), ("wood", box(*corners))]
+        what = scene(method, bodies, WOOD | {"density": density}, obstacles=[FLOOR])
+        solver.load(what)
+        wood = what.particles().material == 0
+        heights = [solver.frame()[: len(wood)][wood, 1].astype(float) for _ in range(200)]
+        lowest = min(each.min() for each in heights) - 0.25
+        assert lowest > 0.49 * what.spacing, "not in the obstacle"
+        if density < 1000:
+            assert abs(np.mean([each.mean() for each in heights[-50:]]) - lower - 0.0625) < what.spacing / 2
+        else:
+            assert heights[-1].min() - 0.25 < 1.6 * what.spacing
+
+
+@pytest.mark.physics
+@pytest.mark.parametrize("method", METHODS)
+def test_a_box_adrift_in_a_periodic_pool(method):
+    """Across the seam, at half a metre a second: it slows down, keeps its draft to a spacing, and by DFSPH momentum along the pool is kept to
+    rounding. WCSPH's floor is not without friction: along it a particle's own forces are scaled up."""
+    corners = [0.6875, 0.4375], [0.9375, 0.5625]
+    bodies = [*wet_around(*corners, [0.0, 0.0], [1.0, 0.5]), ("wood", box(*corners, [0.5, 0.0]))]
+    what = scene(method, bodies, WOOD | {"density": 500.0}, periodic=["x"], solver=STILL[method])
+    solver = SPHSimulator()
+    solver.load(what)
+    mass = np.where(what.particles().material == 0, 0.5, 1.0)
+    before, wood, heights = mass @ solver.state()["velocity"][:, 0], what.particles().material == 0, []
+    for _ in range(200):
+        heights.append(solver.frame()[wood, 1].astype(float).mean())
+    velocity = solver.state()["velocity"][:, 0]
+    assert before == pytest.approx(0.5 * mass[wood].sum())
+    assert method == "wcsph" or abs(mass @ velocity - before) < 2e-5 * (mass @ np.abs(velocity))
+    assert abs(velocity[wood].mean()) < 0.4
+    assert abs(np.mean(heights[-100:]) - 0.5) < what.spacing
+
+
+@pytest.mark.physics
+def test_boxes_in_a_full_box():
+    """By WCSPH: no free surface. A light box rises to the lid, a heavy one sinks; one as dense as water, which displaces its own weight, stays
+    where it is in the box, though this is shaken at 1 g."""
+    corners, solver = ([0.375, 0.375], [0.625, 0.5]), SPHSimulator()
+    shake = {"container": {"sines": [{"amplitude": [9.8, 0.0], "frequency": 2.0, "phase": 0.0}]}}
+    for density, shaken in ((300.0, {}), (2000.0, {}), (1000.0, shake)):
+        what = scene("wcsph", [*wet_around(*corners, [0.0, 0.0], [1.0, 1.0]), ("wood", box(*corners))], WOOD | {"density": density},
+                     WATER | {"sound_speed": 60.0}, frames=201, **shaken)  # fmt: skip
+        solver.load(what)
+        wood = what.particles().material == 0
+        start, way = what.particles().position[wood].mean(0), []
+        for _ in range(200):
+            way.append(solver.frame()[wood].mean(0) - start)
+        if shaken:
+            assert np.abs(way).max() < 0.25 * 0.125
+        else:
+            assert way[-1][1] > 0.3 if density < 1000 else way[-1][1] < -0.3
+
+
+def test_dfsph_refuses_bodies_in_a_full_box():
+    corners = [0.375, 0.375], [0.625, 0.5]
+    what = scene("dfsph", [*wet_around(*corners, [0.0, 0.0], [1.0, 1.0]), ("wood", box(*corners))])
+    with pytest.raises(InputError, match=r"^test: bodies = 5: with the water they fill the box: [^\n]*; leave room or use wcsph$"):
+        SPHSimulator().plan(what)
+
+
+@pytest.mark.physics
+@pytest.mark.parametrize("method", METHODS)
+def test_a_box_in_a_shaken_pool_feels_gravity_that_leans(solvers, method):
+    """A sine that stands at its crest: the same as gravity to the other side, bodies included, to rounding."""
+    corners = [0.375, 0.4375], [0.625, 0.5625]
+    bodies = [*wet_around(*corners, [0.0, 0.0], [1.0, 0.5]), ("wood", box(*corners))]
+    solver, ways = solvers[method, 2], []
+    for changes in ({"container": {"sines": [{"amplitude": [-3.0, 0.0], "frequency": 1e-6, "phase": 90.0}]}}, {"gravity": [3.0, -9.8]}):
+        solver.load(scene(method, bodies, **changes))
+        ways.append([solver.frame() for _ in range(20)])
+    np.testing.assert_allclose(*ways, atol=1e-4)
+    assert (ways[0][-1] - ways[0][0])[:, 0].mean() > 0.005
