@@ -50,7 +50,7 @@ LEAST = 2
 #: (as those of few neighbours in SPlisHSPlasH).
 SPRAY = 0.5
 #: Share of the mean divergence at which its solve ends, and what is rounding of it.
-RELATIVE, ROUNDING = 0.05, 1e-6
+RELATIVE, ROUNDING = 0.2, 1e-6
 #: Rate of the density times the step by which water that no pressure holds to a wall leaves it.
 SUCTION = 1e-5
 #: Excess of density that is rounding: pushed away in every step, it would drive a block in free flight apart.
@@ -197,7 +197,7 @@ class DFSPH:
 
     @ti.func
     def accelerate(self, n, which, pressure: ti.template(), lane):
-        """push[:3]: accelerations by a lane of ``pressure``; in DIVERGENCE the bodies' too, which stay where they are in DENSITY."""
+        """push[:3]: accelerations by a lane of ``pressure``; the bodies' too."""
         b = 2.0 - ti.cast(which, ti.f32)
         for i in range(n):
             self.push[i] = -b * pressure[i][lane] * self.wall[i]
@@ -210,7 +210,7 @@ class DFSPH:
                 self.push[j] += f
             self.push[i] -= total
         if ti.static(self.has_rigid):
-            self.rigid.react(pressure, lane, 1.0 - ti.cast(which, ti.f32))
+            self.rigid.react(pressure, lane, 0.5 * b)
 
     @ti.func
     def conjugate(self, n, which, tolerance, most):
@@ -464,6 +464,8 @@ class DFSPH:
                 base.x[i] += move
                 base.enclose(i)
             if ti.static(self.has_rigid):
+                self.rigid.accelerate(1.0 / dt)
                 self.rigid.step(dt)
+                self.rigid.accelerate(-1.0 / dt)
                 self.rigid.put_back()
         return unsolved
