@@ -487,7 +487,7 @@ class SPHSimulator:
     def limits(self, scene: Scene, speed: float) -> dict[str, float]:
         """Bounds on the time step [s] at a speed of particles [m/s], by what sets them (h: half the support radius).
 
-        WCSPH: cfl spacing / (c + |v|), h / (2 c), h^2 / (25 nu), sqrt(h / |g|) / 4 (Monaghan 1992). DFSPH: (|v| + sqrt(|g| H)) dt + |g| dt^2 = cfl
+        WCSPH: cfl spacing / (c + |v|), h / (2 c), h^2 / (25 nu), sqrt(h / |g|) / 4 (Monaghan 1992). DFSPH: (|v| + sqrt(|g| H / 2)) dt + |g| dt^2 = cfl
         spacing, H: height of the highest body; walls that slide count as particles.
         """
         spacing, support, _ = self._layout(scene)
@@ -496,7 +496,7 @@ class SPHSimulator:
         if scene.solver.method == "dfsph":
             pull = np.abs(np.array(scene.gravity) - scene.acceleration()).max(0)
             speed = max(speed, *(float(np.linalg.norm(velocity)) for velocity in scene.walls.velocity.values()), 0.0)
-            speed += float(np.sqrt(max(pull @ np.subtract(*body.extent()[::-1]) for body in scene.bodies)))
+            speed += float(np.sqrt(max(pull @ np.subtract(*body.extent()[::-1]) for body in scene.bodies) / 2))
             return {"the Courant number": 2 * way / max(speed + np.sqrt(speed**2 + 4 * gravity * way), tiny)}
         sound = water.sound_speed * np.sqrt(self.settings["stiffness"])
         return {
