@@ -159,7 +159,9 @@ class _Kernels(Walls):
                 x[d] -= self.neighbours.length[None][d] * ti.floor(x[d] / self.neighbours.length[None][d])
             else:
                 inside = ti.min(ti.max(x[d], self.extent[0][d] + HAIR), self.extent[1][d] - HAIR)
-                if inside != x[d]:
+                # On a wall, where it was stopped before, no velocity into it is left either.
+                low, high = self.extent[0][d] + ti.static(1.01 * HAIR), self.extent[1][d] - ti.static(1.01 * HAIR)
+                if inside != x[d] or (x[d] < low and self.v[i][d] < 0.0) or (x[d] > high and self.v[i][d] > 0.0):
                     self.v[i][d] = 0.0
                 if finite(x[d]):
                     x[d] = inside

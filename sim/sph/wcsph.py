@@ -204,7 +204,9 @@ class WCSPH:
     def follow(self, i, push, C):
         """Half of what shifting a particle does to the density."""
         rho = self.base.v[i][3]
-        self.base.v[i][3] = ti.max(rho + push[0] * C[0] + push[1] * C[1] + push[2] * C[2], ti.min(rho, LEAST))
+        least, shifted = ti.min(rho, LEAST), rho + push[0] * C[0] + push[1] * C[1] + push[2] * C[2]
+        # Not a maximum, which loses NaN.
+        self.base.v[i][3] = ti.select(shifted < least, least, shifted)
 
     @ti.func
     def step(self, n, dt, g, report: ti.template()):

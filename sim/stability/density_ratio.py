@@ -4,6 +4,7 @@ import time
 
 import numpy as np
 
+from sim.scene import Scene
 from sim.stability import BOUND, Cell
 from sim.stability.driver import SPH, deep, follow, solver_for
 from sim.validation import scene
@@ -56,12 +57,14 @@ def _struck(name: str, dim: int, ratio: float) -> Cell:
 
 
 def _held(name: str, dim: int, ratio: float) -> Cell:
-    """A second in the middle of a pool half a metre deep."""
+    """A second in the middle of a pool half a metre deep, in 3D a quarter wide, with the box across all of it but for a cell at each side."""
     begun, cell = time.perf_counter(), f"{name}, a box of {ratio:g} times water's density in a pool{', 3D' if dim == 3 else ''}"
     low, high, still = 0.1875, 0.3125, {"velocity": [0.0, 0.0]}
     water = [([0.0, 0.0], [0.375, 0.5], still), ([0.625, 0.0], [1.0, 0.5], still), ([0.375, 0.0], [0.625, low], still),
              ([0.375, high], [0.625, 0.5], still)]  # fmt: skip
     what = _bodies(name, dim, ratio, 9.8, water, {"lower": [0.375, low], "upper": [0.625, high]} | still)
+    if dim == 3:
+        what = _narrow(what)
     box = what.particles().material == 1
     run = follow(what, 200)
     if not run.ok:
@@ -77,6 +80,18 @@ def _held(name: str, dim: int, ratio: float) -> Cell:
     numbers = {"height": middle, "energy_growth": growth, "fastest": float(run.speed.max())}
     return Cell("density_ratio", cell, inside and there and growth <= 0.01, POOL, observed, numbers, time.perf_counter() - begun,
                 {cell: run.energy_curve(scale)})  # fmt: skip
+
+
+def _narrow(what: Scene) -> Scene:
+    """The pool from wall to wall along the third axis, the box in its middle."""
+    content = what.to_dict()
+    for body in content["bodies"]:
+        water = body["material"] == "water"
+        body["lower"], body["upper"] = [*body["lower"][:2], 0.0 if water else 0.0625], [*body["upper"][:2], 0.25 if water else 0.1875]
+    low, high = [0.375, 0.1875], [0.625, 0.3125]
+    water = next(body for body in content["bodies"] if body["material"] == "water")
+    content["bodies"] += [water | {"lower": [*low, z], "upper": [*high, z + 0.0625]} for z in (0.0, 0.1875)]
+    return Scene.from_dict(content | {"bounds": [*content["bounds"][:2], [0.0, 0.25]], "cells": [*content["cells"][:2], 4]})
 
 
 def _balls() -> list[Cell]:

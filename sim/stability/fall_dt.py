@@ -13,7 +13,7 @@ SPACING = 0.5 / CELLS
 
 
 def _step(v: float, way: float) -> float:
-    """dt of v dt + g dt^2 = way. A block that stands has pressures that add sqrt(g H) to v."""
+    """dt of v dt + g dt^2 = way. A block that stands has pressures that add sqrt(g H / 2) to v."""
     return 2 * way / (v + np.sqrt(v**2 + 4 * G * way))
 
 
@@ -23,7 +23,7 @@ def run() -> list[Cell]:
     for v in SPEEDS:
         body = {"kind": "box", "lower": [0.375, GAP], "upper": [0.375 + SIDE, GAP + SIDE], "velocity": [0.0, -v]}
         common = {"gravity": [0.0, -G], "solver": {"method": "dfsph"}}
-        (bound, unit), duration = (_step(v + np.sqrt(G * SIDE), way * SPACING) for way in (0.4, 1.0)), 2 * _step(v, 1.0)
+        (bound, unit), duration = (_step(v + np.sqrt(G * SIDE / 2), way * SPACING) for way in (0.4, 1.0)), 2 * _step(v, 1.0)
         for courant in COURANT:
             dt = courant * unit
             what = scene("fall-dt", {"model": "water"}, [body], [[0.0, 1.0]] * 2, [CELLS] * 2, dt * STEPS_A_FRAME, time_step=dt, **common)
