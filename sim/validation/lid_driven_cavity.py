@@ -19,11 +19,7 @@ GHIA = np.loadtxt(Path(__file__).parent / "data" / "ghia_1982.csv", delimiter=",
 
 def run(resolution: int, method: str) -> Outcome:
     """A box and a lid of speed 1, from rest: the flow is steady after 10, and what is compared is the mean over the 5 after that, linear between
-    particles and walls. Error: the largest, over the speed of the lid. A support of three spacings, as of the channel, and no other viscosity.
-
-    Not by DFSPH, which boils in a box without a surface (see Taylor-Green vortices): with 16 particles it is 0.11 off, with 20 already 0.38, and
-    with 40 it was stopped after 40 s.
-    """
+    particles and walls. Error: the largest, over the speed of the lid. A support of three spacings, as of the channel, and no other viscosity."""
     settings = {"support": 3.0} | ({"artificial_viscosity": 0.0} if method == "wcsph" else {"xsph": 0.0})
     what = scene(
         "cavity", {"model": "water", "sound_speed": C, "density": 1.0, "viscosity": 1 / RE},
