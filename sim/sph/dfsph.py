@@ -181,7 +181,7 @@ class DFSPH:
 
     @ti.func
     def rate(self, n, which, field: ti.template(), motion: ti.template(), factor):
-        """push[3]: rate of the density by a ``field`` of the water and ``factor`` times a ``motion`` of the bodies, as the solve ``which`` sees it."""
+        """push[3]: rate of the density by a ``field`` of the water and ``factor`` times a ``motion`` of the bodies, as the solve ``which`` has it."""
         b = 2.0 - ti.cast(which, ti.f32)
         for i in range(n):
             u, w = field[i], self.wall[i]
@@ -291,7 +291,7 @@ class DFSPH:
             if which == DIVERGENCE:
                 for d in ti.static(range(self.dim)):
                     base.v[i][d] += self.push[i][d] / dt
-        if ti.static(self.has_rigid):
+        if ti.static(self.has_rigid):  # noqa: SIM102 (what bodies need is compiled only where they are)
             if which == DIVERGENCE:
                 self.rigid.accelerate(1.0 / dt)
         return iterations, error
@@ -400,8 +400,8 @@ class DFSPH:
     def limit(self, n, g):
         """Largest step, that moves particles by a share of a spacing; the largest speed; whether all are finite, which the largest does not tell.
 
-        To their speed and what gravity adds comes c = sqrt(mean k), k > 0,, sqrt(g H) for water at rest: the density of a particle does not change with its
-        own place at first order, so pressures hold it only by their curvature, k W'' ~ k / spacing^2, a spring whose frequency is c /
+        To their speed and what gravity adds comes c = sqrt(mean k), k > 0, sqrt(g H / 2) for water at rest: the density of a particle does not change
+        with its own place at first order, so pressures hold it only by their curvature, k W'' ~ k / spacing^2, a spring whose frequency is c /
         spacing. Without this limit a pool of 20 layers boiled over at steps of 0.7 spacings / sqrt(g H). Where bodies collide, k is an impulse
         over a step, hence the bound by fall and depth.
         """
