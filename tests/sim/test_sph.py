@@ -489,14 +489,15 @@ def test_a_pool_at_rest_has_its_pressure_from_the_first_solve(periodic, rel):
     assert (rows[1:] + rows[:-1]) / 2 == pytest.approx(1000 * 9.8 * depth, rel=rel)
 
 
-BOXES = {"a block in flight": (2, 0.25, 0.75), "in a corner": (2, 0.0, 0.5), "in a corner in 3D": (3, 0.0, 0.5), "nearly full": (2, 0.0, 0.95)}
+BOXES = {"a block in flight": (2, 0.25, 0.75), "in a corner": (2, 0.0, 0.5), "in a corner in 3D": (3, 0.0, 0.5), "nearly full": (2, 0.0, 0.95),
+         "full": (2, 0.0, 1.0)}  # fmt: skip
 
 
 @pytest.mark.parametrize("speed", [0.1, 2.0])
-@pytest.mark.parametrize("what", [*BOXES, pytest.param("full", marks=pytest.mark.xfail(strict=True, reason="pressures are not free of their mean"))])
+@pytest.mark.parametrize("what", BOXES)
 def test_a_projection_takes_energy(what, speed):
     """Nothing but the solve of velocities changes them: noise has less energy after every step, warm starts included."""
-    solver = stirred(block("dfsph", *(BOXES | {"full": (2, 0.0, 1.0)})[what], jitter=0.3, solver={"xsph": 0.0}), speed)
+    solver = stirred(block("dfsph", *BOXES[what], jitter=0.3, solver={"xsph": 0.0}), speed)
     energy = [solver.diagnostics()["kinetic_energy"]]
     for _ in range(10):
         solver.frame()
@@ -506,7 +507,8 @@ def test_a_projection_takes_energy(what, speed):
 
 def test_a_full_box_stays_free_of_divergence():
     """Noise on a jittered lattice between walls, twenty steps. Mean divergence, apart from its own mean, of the velocities where the step began:
-    below the tolerance, a hundredth of the start's; and, in units of speed / spacing, where it ended: from 0.43 to below 0.02."""
+    what is reported, and below the tolerance, a hundredth of the start's; and, in units of speed / spacing, where it ended: from 0.43 to below
+    0.02."""
     solver = stirred(block("dfsph", lower=0.0, upper=1.0, jitter=0.3, solver={"xsph": 0.0, "divergence_error": 1e-4}), 0.5)
     kernels, n = solver._kernels, len(solver._position)
 
@@ -521,7 +523,8 @@ def test_a_full_box_stays_free_of_divergence():
     for _ in range(20):
         solver.frame()
         found, left = solver.diagnostics(), diverging()[0]
-        assert found["substeps"] == 1 and max(found["divergence_error"], found["dt"] * left) <= 1e-4 < 0.01 * found["dt"] * before
+        assert found["substeps"] == 1 and found["divergence_error"] == pytest.approx(found["dt"] * left, rel=0.01, abs=1e-7)
+        assert found["divergence_error"] <= 1e-4 < 0.01 * found["dt"] * before
     solver._settle()
     assert diverging()[1] < 0.02
 
