@@ -480,8 +480,11 @@ class DFSPH:
                 base.x[i] += move
                 base.enclose(i)
             if ti.static(self.has_rigid):
-                self.rigid.accelerate(1.0 / dt)
+                # What moves places alone is of the density solve; without one the last accelerations are those the velocities have.
+                if ti.static(not self.structure.full):
+                    self.rigid.accelerate(1.0 / dt)
                 self.rigid.step(dt)
-                self.rigid.accelerate(-1.0 / dt)
+                if ti.static(not self.structure.full):
+                    self.rigid.accelerate(-1.0 / dt)
                 self.rigid.put_back()
         return unsolved
