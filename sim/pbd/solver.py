@@ -539,7 +539,7 @@ class PBDSimulator:
         fields = {f"{kept}{name}": (size, n) for kept in ("", "moved ") for name, size in state.items()}
         fields |= {"sums": (16, n), "wall": (16, n), "drift": (16, n), "cell": (4, n), "sorted place": (4, n), "first pair": (4, n + 1),
                    "place when listed": (16, n), "pairs": (4, pairs), "gradients": (16, pairs), "first of a cell": (4, boxes + 2),
-                   "next of a cell": (4, boxes + 2), "walls": (24, ENTRIES + 2)}  # fmt: skip
+                   "next of a cell": (4, boxes + 2), "walls": (28, ENTRIES + 2)}  # fmt: skip
         if structure.bodies:
             fields |= {"slot": (4, n)} | Bodies.sizes(dim, structure.bodies, n)
         context = scene.context_values()

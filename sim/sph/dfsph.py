@@ -20,8 +20,8 @@ Decisions, each against what was here before (as Bender & Koschier: k >= 0, rela
 - Shifting (Lind et al. 2012; Sun et al. 2017) by min(2 dt max|u|, ``lattice_shift``) down the gradient of the concentration, inside. It is part of
   what the density solve sees.
 
-Without a free surface (``full``: the water fills its box) nothing can expand: divergences are then free of their mean, and shifting alone keeps
-the density even.
+Without a free surface (``full``: the water fills its box) nothing can expand: divergences and pressures are then free of their mean, both, so that
+the solve is a projection still (of divergences alone, noise gained a fifth of its energy in a step), and shifting alone keeps the density even.
 
 A solve starts from the pressures of the step before and ends when its mean error over all particles is below ``density_error``
 (``divergence_error``), the one of velocities also below ``RELATIVE`` of what it began with: the mean over a deep pool would pass
@@ -181,7 +181,7 @@ class DFSPH:
 
     @ti.func
     def rate(self, n, which, field: ti.template(), motion: ti.template(), factor):
-        """push[3]: rate of the density by a ``field`` of the water and ``factor`` times a ``motion`` of the bodies, as the solve ``which`` sees it."""
+        """push[3]: rate of the density by a ``field`` of the water and ``factor`` times a ``motion`` of the bodies, as the solve ``which`` has it."""
         b = 2.0 - ti.cast(which, ti.f32)
         for i in range(n):
             u, w = field[i], self.wall[i]
@@ -216,10 +216,22 @@ class DFSPH:
             self.rigid.react(pressure, lane, 0.5 * b)
 
     @ti.func
+    def level(self, n, field: ti.template(), lane: ti.template()):
+        """Take from a lane of a field its mean, without a free surface."""
+        if ti.static(self.structure.full):
+            total = ti.cast(0.0, ti.f64)
+            for i in range(n):
+                total += ti.cast(field[i][lane], ti.f64)
+            mean = ti.cast(total / n, ti.f32)
+            for i in range(n):
+                field[i][lane] -= mean
+
+    @ti.func
     def conjugate(self, n, which, tolerance, most):
         """Conjugate gradients, preconditioned by alpha, from the pressures as they are; iterations and mean error. ``source`` is the residual. The
         first search is along the pressures themselves, by a step of 1."""
         iterations, error, power, going = -1, 1e30, ti.cast(0.0, ti.f64), True
+        self.level(n, self.pressure, 0)
         for i in range(n):
             self.search[i][0] = self.pressure[i][which]
         while going:
@@ -234,9 +246,12 @@ class DFSPH:
                 step = ti.cast(power / ti.max(work, 1e-3 * power), ti.f32)
             fresh, size = ti.cast(0.0, ti.f64), 0.0
             for i in range(n):
+                self.push[i][3] = self.source[i] + step * self.push[i][3]
+            self.level(n, self.push, 3)
+            for i in range(n):
                 if iterations >= 0:
                     self.pressure[i][which] += step * self.search[i][0]
-                r = self.active[i] * (self.source[i] + step * self.push[i][3])
+                r = self.active[i] * self.push[i][3]
                 self.source[i] = r
                 fresh += ti.cast(r * r * self.alpha[i][which], ti.f64)
                 size += ti.abs(r)
@@ -244,6 +259,7 @@ class DFSPH:
                 turn = ti.cast(fresh / power, ti.f32)
             for i in range(n):
                 self.search[i][0] = self.source[i] * self.alpha[i][which] + turn * self.search[i][0]
+            self.level(n, self.search, 0)
             power, error = fresh, size / ti.cast(n, ti.f32)
             iterations += 1
             going = iterations < most and (iterations < LEAST or error > tolerance) and power > 0.0
@@ -260,7 +276,8 @@ class DFSPH:
             for i in range(n):
                 self.move[i] = dt * base.v[i]
         self.rate(n, which, self.move, VELOCITY, dt)
-        mean, size = 0.0, 0.0
+        size = 0.0
+        self.level(n, self.push, 3)
         for i in range(n):
             s, spread, on = self.push[i][3], self.crowd[i][3], 1.0
             if which == DENSITY:
@@ -276,11 +293,7 @@ class DFSPH:
             self.active[i] = on
             self.source[i] = s
             self.pressure[i][which] *= WARM * scale * on
-            mean += s
             size += on * ti.abs(s)
-        if ti.static(self.structure.full):
-            for i in range(n):
-                self.source[i] -= mean / ti.cast(n, ti.f32)
         goal = tolerance
         if which == DIVERGENCE:
             goal = ti.min(goal, ti.max(RELATIVE * size / ti.cast(n, ti.f32), ROUNDING))
@@ -291,7 +304,7 @@ class DFSPH:
             if which == DIVERGENCE:
                 for d in ti.static(range(self.dim)):
                     base.v[i][d] += self.push[i][d] / dt
-        if ti.static(self.has_rigid):
+        if ti.static(self.has_rigid):  # noqa: SIM102 (what bodies need is compiled only where they are)
             if which == DIVERGENCE:
                 self.rigid.accelerate(1.0 / dt)
         return iterations, error
@@ -400,8 +413,8 @@ class DFSPH:
     def limit(self, n, g):
         """Largest step, that moves particles by a share of a spacing; the largest speed; whether all are finite, which the largest does not tell.
 
-        To their speed and what gravity adds comes c = sqrt(mean k), k > 0,, sqrt(g H) for water at rest: the density of a particle does not change with its
-        own place at first order, so pressures hold it only by their curvature, k W'' ~ k / spacing^2, a spring whose frequency is c /
+        To their speed and what gravity adds comes c = sqrt(mean k), k > 0, sqrt(g H / 2) for water at rest: the density of a particle does not change
+        with its own place at first order, so pressures hold it only by their curvature, k W'' ~ k / spacing^2, a spring whose frequency is c /
         spacing. Without this limit a pool of 20 layers boiled over at steps of 0.7 spacings / sqrt(g H). Where bodies collide, k is an impulse
         over a step, hence the bound by fall and depth.
         """
@@ -467,8 +480,11 @@ class DFSPH:
                 base.x[i] += move
                 base.enclose(i)
             if ti.static(self.has_rigid):
-                self.rigid.accelerate(1.0 / dt)
+                # What moves places alone is of the density solve; without one the last accelerations are those the velocities have.
+                if ti.static(not self.structure.full):
+                    self.rigid.accelerate(1.0 / dt)
                 self.rigid.step(dt)
-                self.rigid.accelerate(-1.0 / dt)
+                if ti.static(not self.structure.full):
+                    self.rigid.accelerate(-1.0 / dt)
                 self.rigid.put_back()
         return unsolved

@@ -492,8 +492,8 @@ class SPHSimulator:
     def limits(self, scene: Scene, speed: float) -> dict[str, float]:
         """Bounds on the time step [s] at a speed of particles [m/s], by what sets them (h: half the support radius).
 
-        WCSPH: cfl spacing / (c + |v|), h / (2 c), h^2 / (25 nu), sqrt(h / |g|) / 4 (Monaghan 1992). DFSPH: (|v| + sqrt(|g| H / 2)) dt + |g| dt^2 = cfl
-        spacing, H: height of the highest body; walls that slide count as particles.
+        WCSPH: cfl spacing / (c + |v|), h / (2 c), h^2 / (25 nu), sqrt(h / |g|) / 4 (Monaghan 1992). DFSPH: (|v| + sqrt(|g| H / 2)) dt + |g| dt^2 =
+        cfl spacing, H: height of the highest body; walls that slide count as particles.
         """
         spacing, support, _ = self._layout(scene)
         tiny, gravity = np.finfo(float).tiny, float(np.linalg.norm(np.array(scene.gravity) - scene.acceleration(), axis=-1).max())
@@ -565,7 +565,8 @@ class SPHSimulator:
             "equation of state": "incompressible" if method == "dfsph" else None,
             "pressure solves": "weakly compressible" if method == "wcsph" else None,
             "particle shifting": None if structure.shifting or method == "dfsph" else "shifting: false",
-            "density solve": "no free surface" if structure.full else "weakly compressible" if method == "wcsph" else None, "grid": "particles meet in pairs",
+            "density solve": "no free surface" if structure.full else "weakly compressible" if method == "wcsph" else None,
+            "grid": "particles meet in pairs",
         }
         gravity = float(np.linalg.norm(np.array(scene.gravity) - scene.acceleration(), axis=1).max())
         start = float(np.sqrt((particles.velocity**2).sum(1).max()))
