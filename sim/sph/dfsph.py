@@ -480,11 +480,9 @@ class DFSPH:
                 base.x[i] += move
                 base.enclose(i)
             if ti.static(self.has_rigid):
-                # What moves places alone is of the density solve; without one the last accelerations are those the velocities have.
-                if ti.static(not self.structure.full):
-                    self.rigid.accelerate(1.0 / dt)
+                # What corrects densities moves bodies too, and not on.
+                self.rigid.accelerate(1.0 / dt)
                 self.rigid.step(dt)
-                if ti.static(not self.structure.full):
-                    self.rigid.accelerate(-1.0 / dt)
+                self.rigid.accelerate(-1.0 / dt)
                 self.rigid.put_back()
         return unsolved

@@ -407,7 +407,7 @@ class SPHSimulator:
         faces = max((len(body.vertices) if body.vertices else 6 for body in bodies), default=0)
         rigid = (_power_of_two(len(bodies)), _power_of_two(faces)) if bodies else None
         if rigid and full:
-            remedy = "with the water they fill the box: without a free surface DFSPH has nothing that keeps its density around bodies; leave room or use wcsph"
+            remedy = "with the water they fill the box: without a free surface DFSPH cannot hold its density around bodies; leave room or use wcsph"
             raise InputError(scene.name, "bodies", len(scene.bodies), remedy)
         return Structure(scene.dim, solver.method, periodic, no_slip, viscous, shifting, xsph, full, bool(scene.obstacles), rigid)
 

@@ -23,8 +23,8 @@ def run(resolution: int, method: str) -> Outcome:
     square; a lattice that is as dense has no gap as wide. Voids: area of the holes in it, what is not within it and not connected with the outside.
 
     Voids are missed: a thousandth of the area, less with more particles. They are the gaps of particles out of line, none of them wide enough for one
-    more but a few in bays of the arms' edges. DFSPH, which corrects places by densities and by shifting, loses a few hundredths of the angular momentum,
-    and where the tension is largest, in the middle, its lattice may part and a hole grow.
+    more but a few in bays of the arms' edges. DFSPH, which corrects places by densities and by shifting, loses a few hundredths of the angular
+    momentum, and where the tension is largest, in the middle, its lattice may part and a hole grow.
     """
     from scipy.ndimage import label
 
