@@ -15,10 +15,10 @@ AFFORDABLE = {
     ("rotation", "mpm"): 32, ("return_map", "mpm"): 1000, ("hydrostatics", "mpm"): 32, ("elastic_column", "mpm"): 16, ("axial_bar", "mpm"): 4,
     ("cantilever", "mpm"): 4, ("standing_wave", "mpm"): 32, ("dam_break", "mpm"): 16, ("granular_collapse", "mpm"): 8,
     ("block_on_plane", "mpm"): 32, ("elastic_discs", "mpm"): 40, ("viscoplastic_slump", "mpm"): 80,
-    ("rotation", "wcsph"): 32, ("rotation", "dfsph"): 32, ("hydrostatics", "wcsph"): 16, ("taylor_green", "wcsph"): 30, ("channel", "dfsph"): 30,
-    ("lid_driven_cavity", "wcsph"): 20, ("standing_wave", "wcsph"): 16, ("elliptical_drop", "wcsph"): 30, ("elliptical_drop", "dfsph"): 60,
+    ("rotation", "wcsph"): 32, ("hydrostatics", "wcsph"): 16, ("taylor_green", "wcsph"): 30, ("channel", "dfsph"): 30,
+    ("lid_driven_cavity", "wcsph"): 20, ("standing_wave", "wcsph"): 16, ("elliptical_drop", "wcsph"): 30, ("elliptical_drop", "dfsph"): 120,
     ("dam_break", "wcsph"): 8, ("dam_break", "dfsph"): 8, ("rotation", "pbf"): 32, ("hydrostatics", "pbf"): 16, ("dam_break", "pbf"): 8,
-    ("lid_driven_cavity", "dfsph"): 16, ("hydrostatics", "dfsph"): 16, ("taylor_green", "dfsph"): 50,
+    ("lid_driven_cavity", "dfsph"): 16, ("hydrostatics", "dfsph"): 16, ("taylor_green", "dfsph"): 100,
 }  # fmt: skip
 
 
