@@ -15,8 +15,8 @@ Decisions, each against what was here before (as Bender & Koschier: k >= 0, rela
   close where the pressure is positive; in tension, where pulling on pairs of particles leads to pairing, shifting keeps them even.
 - Mirrored walls (b = 2): the fluid behind a wall has the particle's own pressure and the opposite normal velocity. With b = 1 a wall acts by the
   particle's pressure alone, which was twice what it should be. Densities are of layers that stay (``sim.sph.kernel``): b = 1.
-- Along a wall half of the neighbours are missing, and of a gradient. Pairs beside one are stretched along it (``sim.sph.kernel.STRETCH``), the mean of both
-  ends, so that transposes stay transposes and pairs keep momentum. Where bodies are (``sim.sph.rigid``), b = 2 too, without the stretch.
+- Along a wall half of the neighbours are missing, and of a gradient. Pairs beside one are stretched along it (``sim.sph.kernel.STRETCH``), the mean
+  of both ends, so that transposes stay transposes and pairs keep momentum. Where bodies are (``sim.sph.rigid``), b = 2 too, without the stretch.
 - Shifting (Lind et al. 2012; Sun et al. 2017) by min(2 dt max|u|, ``lattice_shift``) down the gradient of the concentration, inside. It is part of
   what the density solve sees.
 
