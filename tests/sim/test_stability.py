@@ -134,6 +134,7 @@ def test_sand_beyond_the_largest_courant_number_is_found_wrong(monkeypatch):
     module = case("courant")
     monkeypatch.setattr(module, "MATERIALS", {"sand": module.MATERIALS["sand"]})
     monkeypatch.setattr(module, "SPH", {})
+    monkeypatch.setattr(module, "PBF", {})
     monkeypatch.setattr(module, "COURANT", (0.4, 4.0))
     monkeypatch.setattr(module, "COURANT_3D", ())
     assert not wrong(module.run())
