@@ -24,7 +24,7 @@ Decisions:
   A gap that opens draws water from its rim: the rate of the density of water there loses the film's area times the body's speed away from
   the wall, and by the transpose the rim's pressure acts on that area (``film``); where the rim is dry, by as much less. Between bodies there are
   none. Its error is a share of the pressure, not of the buoyancy: under half a metre of water a box an eighth high rises from the floor with half
-  of water's density by DFSPH, with a third by WCSPH.
+  of water's density by DFSPH; by WCSPH it stays there with a tenth.
 - Contacts (``sim.rigid``) follow the pressures, once a step: what they change of a body's velocity, water answers in the next solve.
 - Bodies' particles are behind the water's in all fields, [n, n + members), and are never sorted.
 
@@ -257,8 +257,8 @@ class RigidBodies(Bodies):
         The film is on the sides of the body's lattice that face the wall, nearer than THIN spacings, as far as water's particles do not fill the
         gap: the sum, at the body's particle, of the kernels of those beyond its side over that of a gap full of water. Its pressure is what the
         water pushes with, along the wall, on the sides of the body next to it, BAND spacings high, over their area: sum_i k_i |sum_p V grad W_ip|
-        (``corner_share``). The pressures of single particles will not do: those of DFSPH are up to 2.2 times the water's in a corner, and a tenth
-        more than the water's bears, half a metre deep, a stone a tenth of a metre high."""
+        (``corner_share``). The pressures of single particles will not do: a tenth more than the water's bears, half a metre deep, a stone a
+        tenth of a metre high."""
         base, spacing = self.kernels, 2.0 * self.half[None]
         lowest, q = OVERFLOW, 20.0 * base.number[base.KERNEL] * base.number[base.VOLUME]
         for p in range(self.span[b][0], self.span[b][1]):

@@ -23,7 +23,7 @@ def run(resolution: int, method: str) -> Outcome:
     A support of three spacings: with fewer, layers that slide past each other on their lattice are not rubbed as those of a fluid are (30 particles,
     2.5 spacings: 0.1 off). The implicit viscosity of DFSPH is of first order in time: steps of an eighth of the usual length.
 
-    With 60 particles from wall to wall DFSPH boils from nu t / d^2 = 0.2 on (see Taylor-Green vortices); WCSPH is as good there as with 30.
+    With 60 particles from wall to wall DFSPH is 0.0073 and 0.0066 off.
     """
     curves, total = {}, 0.0
     for name, exact in (("Poiseuille", poiseuille), ("Couette", couette)):

@@ -63,14 +63,14 @@ def run(resolution: int, method: str) -> Outcome:
 
     The sensors are discs 4.2 mm across, 0.01 H (P1) and 0.1 H (P3) above the floor. What is compared is the force of the wall on the water, per
     area, over the height of the sensor, or over two spacings above and below its centre where that is more: the force that the solver's wall exerts
-    (``pressing``), which is what the balance of momentum asks for within 1 % for MPM and WCSPH, not the mean of particles beside the wall, which for
+    (``pressing``), which is what the balance of momentum asks for within 1 % for all three, not the mean of particles beside the wall, which for
     MPM is 14 % more. Arrival: when that exceeds 0.2 rho g H; impulse: its integral over the unit of time after. Never the peak.
 
     P3 holds; the impulse on P1 is missed, by MPM and WCSPH alike, by 27 and 23 %, most of it in the later half of that time. From T = 2.65 to 3.2 the
     measured pressure on P1 is up to 0.3 rho g H below that on P3, a tenth of H higher up. No frictionless stream does that: against a wall it has
     its highest pressure in the corner. What is measured there has less head, as of a boundary layer or an eddy in the corner (or the two records
     are of different runs). Laminar friction is not enough: with a viscosity of 1e-3 Pa s and sticky walls WCSPH is still a fifth above with 64
-    particles, and a quarter with 128. DFSPH's particles carry double the pressure beside walls.
+    particles, and a quarter with 128. DFSPH is 13.5 % above, within the tolerance but to the same side.
     """
     what = tank(resolution, method)
     solver = solver_class(method)()

@@ -44,7 +44,10 @@ def _pool(resolution: int, method: str, solver, offset: float | None = None) -> 
 
     def observe(_):
         state = solver.state()
-        pressure = RHO * C**2 / 7 * (state["stuff.J"] ** -7 - 1) if method == "mpm" else state.get("pressure", state["density"])
+        if method == "mpm":
+            pressure = RHO * C**2 / 7 * (state["stuff.J"] ** -7 - 1)
+        else:
+            pressure = np.full(len(state["density"]), np.nan) if method == "pbf" else state["pressure"]
         return pressure, state["position"][:, 1] - floor, solver.diagnostics()["kinetic_energy"]
 
     found, seconds = timed(solver.frame, 200, observe)

@@ -110,7 +110,7 @@ def test_a_closed_box_keeps_its_density():
 
 
 @pytest.mark.physics
-@pytest.mark.parametrize("method", ["mpm", "wcsph"])
+@pytest.mark.parametrize("method", ["mpm", "wcsph", "dfsph"])
 def test_the_walls_force_is_the_rate_of_change_of_momentum(method):
     """Until the stream hits the far wall all of its momentum along the tank is the impulse of the wall that the column stood against."""
     what = dam_impact.tank(16, method)
