@@ -80,8 +80,8 @@ def run(resolution: int, method: str) -> Outcome:
 
     Rounding alone is left: of L, 7e-9 a substep and always of one sign; of positions, float32's of the box a substep, of either sign.
 
-    DFSPH misses the angular momentum, by a hundredth, all in the first fifth of a turn: it holds the disc together, and corrects places, by densities and by shifting,
-    without the velocities that go with them.
+    DFSPH misses the angular momentum, by a hundredth, all in the first fifth of a turn: it holds the disc together, and corrects places, by
+    densities and by shifting, without the velocities that go with them.
     """
     solver = solver_class(method)()
     drift, momentum, seconds = turn(solver, resolution, method)
