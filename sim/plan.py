@@ -22,7 +22,7 @@ RATES = {
     (2, "water"): 10e6, (2, "sand"): 12e6, (2, "goop"): 11e6, (2, "elastic"): 15e6, (2, "snow"): 8.5e6, (2, "rigid"): 10e6,
     (3, "water"): 15e6, (3, "sand"): 2.7e6, (3, "goop"): 2.7e6, (3, "elastic"): 9e6, (3, "snow"): 2.7e6, (3, "rigid"): 15e6,
     (2, "pbf"): 0.4e6, (3, "pbf"): 0.8e6,
-    (2, "wcsph"): 8e6, (3, "wcsph"): 2e6, (2, "dfsph"): 3.9e6, (3, "dfsph"): 1.35e6,
+    (2, "wcsph"): 7.7e6, (3, "wcsph"): 2.5e6, (2, "dfsph"): 2.2e6, (3, "dfsph"): 1.1e6,
 }
 
 #: Scenes drawn to describe a family.
