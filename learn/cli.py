@@ -19,7 +19,9 @@ def _train(arguments: argparse.Namespace) -> None:
     names = ("seed", "device", "threads", "minutes", "steps")
     overrides = {name: getattr(arguments, name) for name in names if getattr(arguments, name) is not None}
     config = load_config(arguments.config, overrides)
-    print(json.dumps(train(config, arguments.data, arguments.out, arguments.config), indent=1, sort_keys=True))
+    found = train(config, arguments.data, arguments.out, arguments.config)
+    if found:
+        print(json.dumps(found, indent=1, sort_keys=True))
 
 
 def _rollout(arguments: argparse.Namespace) -> None:

@@ -11,13 +11,14 @@ import json
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 from pydantic import BaseModel, ConfigDict, Field
 
+from learn.parallel import Processes
 from sim.errors import InputError
 from sim.trajectory import KINEMATIC_TYPE, ShardReader, Trajectory
 
@@ -126,13 +127,15 @@ class Windows:
     """A batch of training windows, several trajectories side by side as one graph.
 
     position [frames, total, dim] float32; particle_type [total] int64; example [total] int64: which window a particle is of, ascending
-    from 0; context [frames, examples, c] float32 or None.
+    from 0; context [frames, examples, c] float32 or None. place: of a batch that several processes share, how many particles come before these, and
+    how many there are in all.
     """
 
     position: torch.Tensor
     particle_type: torch.Tensor
     example: torch.Tensor
     context: torch.Tensor | None = None
+    place: tuple[int, int] | None = None
 
     @property
     def examples(self) -> int:
@@ -141,7 +144,7 @@ class Windows:
     def to(self, device: torch.device | str) -> Windows:
         """The same windows on ``device``."""
         context = None if self.context is None else self.context.to(device)
-        return Windows(self.position.to(device), self.particle_type.to(device), self.example.to(device), context)
+        return Windows(self.position.to(device), self.particle_type.to(device), self.example.to(device), context, self.place)
 
 
 class _Moments:
@@ -427,10 +430,21 @@ class Sampler:
 
     Epoch e of seed s is the permutation that ``default_rng([s, e])`` draws over all windows. A batch never spans two epochs: the few
     windows left at the end are dropped. A new window length (a model may lengthen its unrolling as training goes) begins a new epoch.
+
+    A batch has ``batch`` windows, or those of at most so many ``edges``, estimated as particles times the data's mean neighbours; one at least for
+    each of ``processes``, of which it then holds this one's share.
     """
 
-    def __init__(self, dataset: Dataset, settings: DataSettings, batch: int, seed: int):
+    def __init__(self, dataset: Dataset, settings: DataSettings, batch: int | None, seed: int, edges: int | None = None,
+                 processes: Processes | None = None):
         self.dataset, self.settings, self.size, self.seed = dataset, settings, batch, seed
+        self.processes, self.edges = processes, edges
+        self.least = processes.size if processes else 1
+        if edges is not None:
+            neighbours = (dataset.content.get("statistics") or {}).get("neighbours")
+            if not isinstance(neighbours, (int, float)) or not 0 < neighbours < math.inf:
+                raise InputError(dataset.path, "statistics.neighbours", neighbours, "training.edges needs it; generate the data set again")
+            self._edges = np.array([shape[1] for shape in dataset.shapes]) * neighbours
         common = dataset.common
         self._flips = np.array([settings.mirror and g == 0 for g in common["gravity"]])
         if settings.mirror and dataset.context(0) is not None:
@@ -446,20 +460,41 @@ class Sampler:
     def _length(self, frames: int) -> None:
         self.frames = frames
         self._rows = self.dataset.windows(frames, self.settings.stride, self.settings.skip_rest)
-        if len(self._rows) < self.size:
+        if len(self._rows) < (self.size or self.least):
             remedy = f"the {self.dataset.split} split has only {len(self._rows)} windows of {frames} frames"
-            raise InputError(self.dataset.path, "training.batch", self.size, remedy)
+            raise InputError(self.dataset.path, "training.batch", self.size or self.least, remedy)
+
+    def _pick(self) -> np.ndarray:
+        """Windows of the next batch; none where the epoch ends before it is full."""
+        if self.size is not None:
+            pick = self._order[self.offset : self.offset + self.size]
+            return pick if len(pick) == self.size else pick[:0]
+        edges = self._edges[self._rows[self._order[self.offset : self.offset + 1 + int(self.edges / self._edges.min()) + self.least], 0]].cumsum()
+        count = max(int(np.searchsorted(edges, self.edges, side="right")), self.least)
+        return self._order[self.offset : self.offset + count] if count < len(edges) else self._order[:0]
 
     def next(self, frames: int) -> Windows:
         """The next batch, windows of ``frames`` frames."""
-        if frames != self.frames or self.offset + self.size > len(self._order):
-            if frames != self.frames:
-                self._length(frames)
-            self.epoch, self.offset = self.epoch + 1, 0
-            self._shuffle()
-        pick = self._order[self.offset : self.offset + self.size]
-        self.offset += self.size
-        return self.dataset.batch(self._rows[pick], frames, self.settings.stride, None if self._mirror is None else self._mirror[pick])
+        if frames != self.frames:
+            self._length(frames)
+            self._begin_epoch()
+        pick = self._pick()
+        if len(pick) == 0:
+            self._begin_epoch()
+            pick = self._pick()
+            # An epoch that holds no full batch is one.
+            pick = pick if len(pick) else self._order
+        self.offset += len(pick)
+        rows, mirror = self._rows[pick], None if self._mirror is None else self._mirror[pick]
+        if self.least == 1:
+            return self.dataset.batch(rows, frames, self.settings.stride, mirror)
+        mine, counts = self.processes.share(rows), [self.dataset.shapes[number][1] for number in rows[:, 0]]
+        windows = self.dataset.batch(rows[mine], frames, self.settings.stride, None if mirror is None else mirror[mine])
+        return replace(windows, place=(sum(counts[: mine.start]), sum(counts)))
+
+    def _begin_epoch(self) -> None:
+        self.epoch, self.offset = self.epoch + 1, 0
+        self._shuffle()
 
     def state(self) -> dict[str, int]:
         """JSON-able; ``restore`` continues from it bitwise."""

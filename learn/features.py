@@ -28,16 +28,21 @@ SMALLEST_STD = 1e-8
 InputScaling = Literal["velocity", "acceleration", "last"]
 
 
-def random_walk_noise(position: Tensor, sigma: float | Tensor, generator: torch.Generator, moving: Tensor | None = None) -> Tensor:
+def random_walk_noise(
+    position: Tensor, sigma: float | Tensor, generator: torch.Generator, moving: Tensor | None = None, place: tuple[int, int] | None = None
+) -> Tensor:
     """Noise for a window of positions whose velocities have done a random walk; [frames, particles, dim], zero in the first frame.
 
     Each of the C = frames - 1 velocities adds N(0, sigma^2 / C) per axis, summed along the window, so that the last velocity's noise
     has standard deviation ``sigma`` [length / frame] (a number, or [dim]); summed once more into positions. Particles outside
     ``moving`` [particles] get none.
-    Drawn on the CPU, so that a seed means the same noise on every device.
+    Drawn on the CPU, so that a seed means the same noise on every device; and for the whole batch of which these particles are a process's share
+    (``place``: ``Windows.place``), so that it means the same on any number of processes.
     """
     frames, particles, dim = position.shape
-    steps = torch.randn((frames - 1, particles, dim), generator=generator, dtype=torch.float32) * (sigma / math.sqrt(frames - 1))
+    first, whole = place or (0, particles)
+    steps = torch.randn((frames - 1, whole, dim), generator=generator, dtype=torch.float32)[:, first : first + particles]
+    steps = steps * (sigma / math.sqrt(frames - 1))
     steps = steps.to(position)
     noise = torch.cat([torch.zeros_like(position[:1]), steps.cumsum(0).cumsum(0)])
     return noise if moving is None else noise * moving[:, None]

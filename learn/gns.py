@@ -286,7 +286,7 @@ class GNS(nn.Module):
         """
         given = self.velocities + 1
         moving = self.features.moving(windows.particle_type)
-        noise = random_walk_noise(windows.position[:given], self.sigma, generator, moving)
+        noise = random_walk_noise(windows.position[:given], self.sigma, generator, moving, windows.place)
         position = windows.position[:given] + noise
         total = position.new_zeros(())
         calls = len(windows.position) - given

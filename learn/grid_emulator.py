@@ -355,10 +355,13 @@ class GridEmulator(nn.Module):
         window's frame j of a call from ballistic flight, at least ``floor`` spacings (otherwise free flight would be all noise).
         """
         history, m = self.options.history, self.options.frames_per_call
-        if 0 < self.options.select < windows.examples:
-            windows = self._select(windows, generator)
+        select = self.options.select
+        if windows.place is not None:  # of its own windows a process selects its share, and judges them by their own deviations
+            select = max(round(select * len(windows.example) / windows.place[1]), 1 if select else 0)
+        if 0 < select < windows.examples:
+            windows = self._select(windows, select, generator)
         moving = windows.particle_type != KINEMATIC_TYPE
-        noise = random_walk_noise(windows.position[:history], self.options.noise * self.velocity_std, generator, moving)
+        noise = random_walk_noise(windows.position[:history], self.options.noise * self.velocity_std, generator, moving, windows.place)
         state = windows.position[:history] + noise
         target = windows.position[history:] + noise[-1]
         scale = self._scale(windows.position, moving)
@@ -381,8 +384,8 @@ class GridEmulator(nn.Module):
         deviation = (position[now + 1 :] - flight)[:, moving].square().mean((1, 2)).sqrt()
         return deviation.clamp(min=self.options.floor * self.spec.spacing)
 
-    def _select(self, windows: Windows, generator: torch.Generator) -> Windows:
-        """``select`` of the windows, without replacement, with p = 1/2 uniform + 1/2 proportional to the rms deviation from flight.
+    def _select(self, windows: Windows, count: int, generator: torch.Generator) -> Windows:
+        """``count`` of the windows, without replacement, with p = 1/2 uniform + 1/2 proportional to the rms deviation from flight.
 
         A window in thirty holds the first touch of a wall, and nine tenths of the error of a batch: uniform sampling starves on it.
         """
@@ -391,7 +394,7 @@ class GridEmulator(nn.Module):
         energy = position.new_zeros(windows.examples).index_add(0, windows.example, change.square().sum((0, 2)))
         rms = (energy / torch.bincount(windows.example)).sqrt().cpu()
         chance = 0.5 / windows.examples + 0.5 * rms / rms.sum().clamp(min=1e-30)
-        chosen = torch.multinomial(chance, self.options.select, generator=generator).sort().values.to(position.device)
+        chosen = torch.multinomial(chance, count, generator=generator).sort().values.to(position.device)
         rank = torch.full((windows.examples,), -1, device=position.device)
         rank[chosen] = torch.arange(len(chosen), device=position.device)
         example = rank[windows.example]

@@ -21,6 +21,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal
 
@@ -33,12 +34,13 @@ from torch.optim.adam import adam
 from tqdm import tqdm
 
 from learn.checkpoint import STATE_KEYS, build_model, load_state, load_weights, save_model, save_state, validate
-from learn.dataset import Dataset, DataSettings, Sampler
+from learn.dataset import Dataset, DataSettings, Sampler, Windows
 from learn.metrics import frame_mse, spacing_ratio
+from learn.parallel import Processes
 from sim import __version__
 from sim.errors import InputError, RunError
 from sim.simulator import rollout, start_from
-from sim.trajectory import Trajectory, write_json, write_text
+from sim.trajectory import KINEMATIC_TYPE, Trajectory, write_json, write_text
 
 LOG_COLUMNS = ("step", "seconds", "loss", "learning_rate", "gradient_norm", "window")
 VALIDATION_COLUMNS = ("step", "seconds", "rollout_mse", "spacing_ratio", "finished", "best")
@@ -51,7 +53,8 @@ class TrainSettings(BaseModel):
 
     steps: int | None = Field(None, ge=1)  # budget in optimiser steps
     minutes: float | None = Field(None, gt=0, allow_inf_nan=False)  # budget in minutes of wall time, validation included
-    batch: int = Field(2, ge=1)  # windows a step
+    batch: int = Field(2, ge=1)  # windows a step, of all processes together
+    edges: int | None = Field(None, ge=1)  # instead of ``batch``: as many windows as have so many edges, by the data's mean neighbours
     learning_rate: float = Field(1e-4, gt=0, allow_inf_nan=False)
     final_learning_rate: float = Field(1e-6, ge=0, allow_inf_nan=False)  # floor of the schedule
     schedule: Literal["cosine", "exponential"] = "cosine"  # over the budget; or the paper's decay over steps
@@ -71,6 +74,7 @@ class TrainSettings(BaseModel):
     seed: int = Field(0, ge=0, lt=2**63)
     threads: int = Field(1, ge=1, le=1024)  # CPU threads; resuming is bitwise with one
     device: Literal["auto", "cpu", "cuda"] = "auto"  # auto: cuda where there is one
+    tensorboard: bool = False  # log.csv and validation.csv into the run folder's tensorboard/ too; needs the package tensorboard
 
     @model_validator(mode="after")
     def _one_budget(self) -> TrainSettings:
@@ -268,7 +272,8 @@ class _Table:
 class Trainer:
     """One training run: construct (checks everything and writes nothing), then ``run()``.
 
-    data: folder of the data set with the splits ``train`` and ``valid``; run: the run folder; where: names the configuration in errors.
+    data: folder of the data set with the splits ``train`` and ``valid``; run: the run folder; where: names the configuration in errors. Of the
+    processes of a ``torchrun`` (``learn.parallel``) the first writes, and says what is said.
     Raises ``InputError`` for faults of the input, among them a run folder that holds another run.
     """
 
@@ -277,7 +282,8 @@ class Trainer:
         self.started = time.perf_counter()
         if self.folder.exists() and not self.folder.is_dir():
             raise InputError(self.folder, "--out", str(self.folder), "is not a folder; give another name")
-        self.device = resolve_device(self.settings.device, where)
+        self.processes = Processes(resolve_device(self.settings.device, where), where)
+        self.device = self.processes.device
         torch.set_num_threads(self.settings.threads)
         self.train_data, self.valid_data = Dataset(data, "train"), Dataset(data, "valid")
         self.spec = self.train_data.spec(config.data.stride)
@@ -286,7 +292,8 @@ class Trainer:
         self.parameters = [parameter for parameter in self.model.parameters() if parameter.requires_grad]
         self.optimizer = OPTIMIZERS[self.settings.optimizer](self.parameters, self.settings.weight_decay)
         self.average = {name: value.detach().clone() for name, value in self.model.state_dict().items()}
-        self.sampler = Sampler(self.train_data, config.data, self.settings.batch, self.settings.seed)
+        batch = None if self.settings.edges else self.settings.batch
+        self.sampler = Sampler(self.train_data, config.data, batch, self.settings.seed, self.settings.edges, self.processes)
         self.generator = torch.Generator().manual_seed(self.settings.seed)
         self.progress_state = {
             "step": 0, "seconds": 0.0, "validated_step": 0, "validations": 0, "best_mse": None, "best_step": None,
@@ -302,10 +309,16 @@ class Trainer:
 
     def _check_lengths(self) -> None:
         """Windows and validation rollouts must fit in the trajectories, at the start of the training and at its end."""
+        least = self.processes.size
+        batch = least if self.settings.edges else self.settings.batch
+        if batch < least:
+            raise InputError(self.where, "training.batch", batch, f"must be at least 1 a process, of which there are {least}")
+        if self.settings.tensorboard and find_spec("tensorboard") is None:
+            raise InputError(self.where, "training.tensorboard", True, "the package tensorboard is missing; pip install it, or set false")
         for progress in (0.0, 1.0):
             found = self.train_data.windows(self.model.window(progress), self.config.data.stride, self.config.data.skip_rest)
-            if len(found) < self.settings.batch:
-                raise InputError(self.where, "training.batch", self.settings.batch, f"the training split has only {len(found)} windows")
+            if len(found) < batch:
+                raise InputError(self.where, "training.batch", batch, f"the training split has only {len(found)} windows")
         shortest = min(shape[0] for shape in self.valid_data.shapes[: self.settings.validation_trajectories])
         if shortest <= self.model.history:
             raise InputError(self.valid_data.path, "splits.valid", shortest, f"needs trajectories of more than {self.model.history} frames")
@@ -329,7 +342,7 @@ class Trainer:
             self.generator.set_state(state["generator"])
             torch.set_rng_state(state["torch_random"])
             if self.device.type == "cuda" and state["device_random"]:
-                torch.cuda.set_rng_state_all(state["device_random"])
+                torch.cuda.set_rng_state(state["device_random"][0], self.device)
             self.progress_state = {name: state["progress"][name] for name in self.progress_state}
             if not all(value is None or isinstance(value, (int, float)) for value in self.progress_state.values()):
                 raise ValueError("progress must hold numbers")
@@ -368,16 +381,25 @@ class Trainer:
         except OSError as error:
             reason = error.strerror or error
             raise RunError(f"{self.folder}: cannot be written ({reason}); mend that and give the same command again to resume") from None
+        finally:
+            self.processes.close()
 
     def _run(self) -> dict:
         done = self.folder / "done.json"
         if done.is_file() and self.step > 0 and self._finished_before(done):
             return json.loads(done.read_text())
+        if not self.processes.leads:
+            return self._follow()
         self.folder.mkdir(parents=True, exist_ok=True)
         for abandoned in self.folder.glob(".*.pt.*.tmp.pt"):  # what a kill in the middle of writing left
             abandoned.unlink()
         self.log = _Table(self.folder / "log.csv", LOG_COLUMNS, self.step)
         self.validation = _Table(self.folder / "validation.csv", VALIDATION_COLUMNS, self.progress_state["validated_step"])
+        self.board = None
+        if self.settings.tensorboard:
+            from torch.utils.tensorboard import SummaryWriter
+
+            self.board = SummaryWriter(str(self.folder / "tensorboard"), purge_step=self.step)
         self._saved_at, self._printed_at = time.perf_counter(), -math.inf
         self.trajectories = [self.valid_data.trajectory(number) for number in range(min(self.settings.validation_trajectories, len(self.valid_data)))]
         self.model.train()
@@ -391,14 +413,28 @@ class Trainer:
         finally:
             self.log.close()
             self.validation.close()
+            if self.board:
+                self.board.close()
         content = {
             "steps": self.step, "seconds": self.seconds(), "validation_seconds": self.progress_state["validation_seconds"],
             "best_rollout_mse": self.progress_state["best_mse"], "best_step": self.progress_state["best_step"],
             "parameters": sum(parameter.numel() for parameter in self.parameters), "model": self.config.model,
-            "device": str(self.device), "threads": self.settings.threads, "config": self._config_dict(),
+            "device": str(self.device), "threads": self.settings.threads, "processes": self.processes.size, "config": self._config_dict(),
         }
         write_json(done, content)
         return content
+
+    def _follow(self) -> dict:
+        """What a process does that does not lead; returns nothing of interest."""
+        self.model.train()
+        with self._signals():
+            while True:
+                progress, stop = self.processes.agree(0.0, bool(self._stop))
+                if progress >= 1:
+                    return {}
+                if stop:
+                    raise RunError(f"{self.folder}: stopped at step {self.step}")
+                self._train_step(progress)
 
     def _finished_before(self, done: Path) -> bool:
         try:
@@ -411,9 +447,11 @@ class Trainer:
             progress = self.progress()
             if self._validation_due(progress):
                 self._validate()
+            progress, stop = self.processes.agree(progress, bool(self._stop))
             if progress >= 1:
                 return
-            if self._stop:
+            if stop:
+                self._stop = self._stop or "another process"
                 raise _Interrupted
             self._train_step(progress)
             every = self.settings.checkpoint_every
@@ -428,8 +466,9 @@ class Trainer:
         for parameter in self.parameters:
             parameter.grad = None
         loss.backward()
+        loss_value = self._join(float(loss.detach()), windows)
         norm = torch.nn.utils.clip_grad_norm_(self.parameters, self.settings.gradient_clip or math.inf)
-        loss_value, norm_value = float(loss.detach()), float(norm)
+        norm_value = float(norm)
         if not (math.isfinite(loss_value) and math.isfinite(norm_value)):
             kept = "checkpoint.pt keeps good weights" if (self.folder / "checkpoint.pt").is_file() else "no checkpoint was written yet"
             raise RunError(
@@ -442,12 +481,28 @@ class Trainer:
         state["loss_sum"] += loss_value
         state["norm_sum"] += norm_value
         state["logged"] += 1
-        if self.step % self.settings.log_every == 0:
+        if self.processes.leads and self.step % self.settings.log_every == 0:
             count = state["logged"]
             mean = state["loss_sum"] / count
+            if self.board:
+                self.board.add_scalar("loss", mean, self.step)
+                self.board.add_scalar("learning rate", rate, self.step)
             self.log.add(self.step, f"{self.seconds():.3f}", repr(mean), repr(rate), repr(state["norm_sum"] / count), frames)
             state["loss_sum"], state["norm_sum"], state["logged"] = 0.0, 0.0, 0
             self._show(mean, rate)
+
+    def _join(self, loss: float, windows: Windows) -> float:
+        """The loss and, in place, the gradient of the whole batch: those of the processes, weighted by the particles they are means over."""
+        if windows.place is None:
+            return loss
+        share = len(windows.example) / windows.place[1]
+        if KINEMATIC_TYPE in self.spec.particle_types:
+            moving = float((windows.particle_type != KINEMATIC_TYPE).sum())
+            share = moving / self.processes.add([], [moving])[0]
+        for parameter in self.parameters:
+            if parameter.grad is not None:
+                parameter.grad.mul_(share)
+        return self.processes.add(self.parameters, [share * loss])[0]
 
     @torch.no_grad()
     def _update_average(self) -> None:
@@ -506,6 +561,8 @@ class Trainer:
                 # JSON has no infinity: a model none of whose rollouts finished is the largest number.
                 state["best_mse"], state["best_step"] = min(mse, sys.float_info.max), self.step
                 save_model(self.folder / "best.pt", model, self._provenance())
+        if self.board:
+            self.board.add_scalar("rollout MSE", mse, self.step)
         self.validation.add(self.step, f"{self.seconds():.3f}", repr(mse), repr(ratio), repr(finished), int(best))
         self._say(f"step {self.step}: validation rollout MSE {mse:.4g}, spacing ratio {ratio:.3f}{', best' if best else ''}")
         self._checkpoint()
@@ -527,7 +584,7 @@ class Trainer:
             "config": self._config_dict(), "spec": json.loads(json.dumps(self.spec.to_dict())), "model": self.model.state_dict(),
             "average": self.average, "optimizer": self.optimizer.state(), "sampler": self.sampler.state(),
             "generator": self.generator.get_state(), "torch_random": torch.get_rng_state(),
-            "device_random": torch.cuda.get_rng_state_all() if self.device.type == "cuda" else [], "progress": dict(self.progress_state),
+            "device_random": [torch.cuda.get_rng_state(self.device)] if self.device.type == "cuda" else [], "progress": dict(self.progress_state),
         }
         assert set(state) == set(STATE_KEYS)
         save_state(self.folder / "checkpoint.pt", state)
