@@ -25,15 +25,28 @@ def _train(arguments: argparse.Namespace) -> None:
 
 
 def _rollout(arguments: argparse.Namespace) -> None:
-    from learn.rollout import rollout_dataset
+    from learn.rollout import rollout_dataset, rollout_scene
     from learn.train import resolve_device
 
-    cost = rollout_dataset(
-        arguments.checkpoint, arguments.data, arguments.split, arguments.out, count=arguments.count, frames=arguments.frames,
-        device=resolve_device(arguments.device, "command line"), threads=arguments.threads,
-    )
-    frames = sum(entry["frames"] for entry in cost["trajectories"].values())
-    print(f"{arguments.out}: {len(cost['trajectories'])} rollouts, {frames} frames, {cost['wall_seconds']:.2f} s")
+    if (arguments.scene is None) == (arguments.data is None):
+        raise InputError("command line", "--data", arguments.data, "give a SCENE file or --data DIR, one of the two")
+    common = {"frames": arguments.frames, "device": resolve_device(arguments.device, "command line"), "threads": arguments.threads}
+    if arguments.scene is None:
+        for option in ("seed", "variant"):
+            if getattr(arguments, option) is not None:
+                raise InputError("command line", f"--{option}", getattr(arguments, option), "is for a SCENE file; a data set has its own")
+        cost = rollout_dataset(arguments.checkpoint, arguments.data, arguments.split or "test", arguments.out, count=arguments.count, **common)
+    else:
+        if arguments.split is not None:
+            raise InputError("command line", "--split", arguments.split, "is for --data; draws of a SCENE file are those of its test split")
+        cost = rollout_scene(arguments.checkpoint, arguments.scene, arguments.out, variant=arguments.variant, seed=arguments.seed or 0,
+                             count=arguments.count or 1, **common)  # fmt: skip
+    rollouts = cost["trajectories"].values()
+    escaped = [entry["escaped"] for entry in rollouts if entry["escaped"] is not None]
+    remarks = [f"{len(cost['failed'])} failed: {next(iter(cost['failed'].values()))}"] if cost["failed"] else []
+    remarks += [f"{len(escaped)} left the box, the first at frame {min(escaped)}"] if escaped else []
+    frames = sum(entry["frames"] for entry in rollouts)
+    print("; ".join([f"{arguments.out}: {len(rollouts)} rollouts, {frames} frames, {cost['wall_seconds']:.2f} s", *remarks]))
 
 
 def _info(arguments: argparse.Namespace) -> None:
@@ -53,6 +66,14 @@ def _positive(text: str) -> int:
     return value
 
 
+def _whole(text: str) -> int:
+    value = int(text)
+    if value < 0:
+        raise ValueError
+    return value
+
+
+_whole.__name__ = "integer >= 0"
 _positive.__name__ = "integer >= 1"  # what argparse names in its message
 
 
@@ -73,13 +94,16 @@ def parser() -> argparse.ArgumentParser:
     budget.add_argument("--steps", type=int, help="budget in steps, instead of the configuration's")
     train.set_defaults(act=_train)
 
-    text = "Roll a checkpoint out over the trajectories of a data set, into a trajectory file like the solver's."
-    rollout = commands.add_parser("rollout", help="roll a checkpoint out over a data set", description=text)
+    text = "Roll a checkpoint out over the trajectories of a data set, or from the first frames of a scene, into a trajectory file like the solver's."
+    rollout = commands.add_parser("rollout", help="roll a checkpoint out over a data set or from a scene", description=text)
     rollout.add_argument("checkpoint", metavar="CHECKPOINT", help="a best.pt")
-    rollout.add_argument("--data", required=True, metavar="DIR", help="data set")
-    rollout.add_argument("--split", default="test", help="default: %(default)s")
-    rollout.add_argument("--count", type=_positive, help="trajectories, default: all of the split")
-    rollout.add_argument("--frames", type=_positive, help="predicted frames, default: to the end of the true trajectory")
+    rollout.add_argument("scene", metavar="SCENE", nargs="?", help="a scene file, whose first frames the solver makes")
+    rollout.add_argument("--data", metavar="DIR", help="instead of SCENE: a data set")
+    rollout.add_argument("--split", help="of the data set, default: test")
+    rollout.add_argument("--variant", help="a named variant of the scene file")
+    rollout.add_argument("--seed", type=_whole, help="of the scene's draws, default: 0")
+    rollout.add_argument("--count", type=_positive, help="trajectories, default: all of the split, one of a scene")
+    rollout.add_argument("--frames", type=_positive, help="predicted frames, default: to the end of the true trajectory or the scene")
     rollout.add_argument("--out", required=True, metavar="FILE", help="shard to write; run times go to FILE.cost.json")
     rollout.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="default: %(default)s")
     rollout.add_argument("--threads", type=_positive, default=1, help="CPU threads, default: %(default)s")

@@ -12,7 +12,7 @@ from typing import Literal, Protocol
 
 import numpy as np
 
-from sim.trajectory import Trajectory
+from sim.trajectory import KINEMATIC_TYPE, Trajectory
 
 Kind = Literal["reference", "solver", "learned", "trivial", "oracle", "floor"]
 
@@ -69,12 +69,14 @@ class Simulator(Protocol):
 
 @dataclass(frozen=True)
 class Rollout:
-    """position [frames, particles, dim] float32, NaN after a failure; seconds: run time without ``begin``; status as in ``Trajectory``."""
+    """position [frames, particles, dim] float32, NaN after a failure; seconds: run time without ``begin``; status as in ``Trajectory``; escaped: the
+    first frame in which a particle that moves is further than the radius outside the bounds, None if none is."""
 
     position: np.ndarray
     seconds: float
     begin_seconds: float
     status: str
+    escaped: int | None = None
 
 
 class SimulationError(RuntimeError):
@@ -91,7 +93,8 @@ def rollout(simulator: Simulator, start: Start, frames: int) -> Rollout:
     simulator.begin(start)
     begin_seconds = clock() - begun
     position = np.full((frames, *start.history.shape[1:]), np.nan, np.float32)
-    done, status, seconds = 0, "ok", 0.0
+    done, status, seconds, escaped = 0, "ok", 0.0, None
+    moving, (lower, upper) = start.particle_type != KINEMATIC_TYPE, np.asarray(start.bounds, float).T
     while done < frames:
         begun = clock()
         try:
@@ -105,8 +108,11 @@ def rollout(simulator: Simulator, start: Start, frames: int) -> Rollout:
         usable = len(block) if finite.all() else int(np.argmin(finite))
         count = min(usable, frames - done)
         position[done : done + count] = block[:count]
+        if escaped is None:
+            away = ((block[:count, moving] < lower - start.radius) | (block[:count, moving] > upper + start.radius)).any(axis=(1, 2))
+            escaped = start.present + 1 + done + int(np.argmax(away)) if away.any() else None
         done += count
         if usable < len(block) and done < frames:
             status = f"failed: non-finite position (frame {start.present + 1 + done})"
             break
-    return Rollout(position=position, seconds=seconds, begin_seconds=begin_seconds, status=status)
+    return Rollout(position=position, seconds=seconds, begin_seconds=begin_seconds, status=status, escaped=escaped)
