@@ -145,6 +145,51 @@ def test_killed_and_resumed_is_bitwise_unbroken(unbroken: Path, bounce_dataset: 
     assert_same_run(run, unbroken)
 
 
+FORKS = """
+import os, random, signal, sys, time
+sys.path[:0] = [{here!r}, {root!r}]
+import dummy_model, torch
+torch.set_num_threads(1)
+from learn.model import MODELS
+MODELS["dummy"] = ("dummy_model", "Dummy")
+from learn.train import Config, Trainer
+plain = dummy_model.Dummy.loss
+def slow(self, *arguments):
+    time.sleep(0.005)
+    return plain(self, *arguments)
+dummy_model.Dummy.loss = slow
+instants = random.Random({seed})
+killed = 0
+while killed < {kills}:
+    child = os.fork()
+    if child == 0:
+        Trainer(Config.model_validate_json({config!r}), {data!r}, {run!r}).run()
+        os._exit(0)
+    time.sleep(instants.uniform(0.02, 0.3))
+    os.kill(child, signal.SIGKILL)
+    _, status = os.waitpid(child, 0)
+    if os.WIFSIGNALED(status):
+        killed += 1
+    else:
+        break
+print(killed)
+"""
+
+
+def test_killed_at_twenty_random_instants(unbroken: Path, bounce_dataset: Path, tmp_path: Path) -> None:
+    """kill -9 wherever it hits: before the first checkpoint, in a write, in a validation. A run that ends first is begun anew."""
+    root, killed, run, seed = Path(training.__file__).parents[1], 0, tmp_path / "run", 0
+    while killed < 20:
+        run, seed = tmp_path / f"run-{seed}", seed + 1
+        code = FORKS.format(here=str(Path(__file__).parent), root=str(root), config=config().model_dump_json(), data=str(bounce_dataset),
+                            run=str(run), seed=seed, kills=20 - killed)  # fmt: skip
+        child = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+        assert child.returncode == 0, child.stderr
+        killed += int(child.stdout)
+        train(config(), bounce_dataset, run)
+        assert_same_run(run, unbroken)
+
+
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_stops_with_a_checkpoint(unbroken: Path, bounce_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int) -> None:
     """A signal in a step, then one in a validation rollout; the run ends bitwise like the unbroken one."""
