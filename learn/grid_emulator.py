@@ -8,10 +8,13 @@ only (a dense 40 x 40 U-Net spends nine tenths of its work on empty air, and a b
 One call, all lengths in box units and times in model frames (dt = 1):
 
     w_ip   = prod_a (1 - |x_p - x_i|_a / H_a)_+                              bilinear weights, node i, particle p
-    vbar_i = sum_p w_ip v_p / (sum_p w_ip + eps)                             particles to grid
+    vbar_i = sum_p w_ip v_p / (sum_p w_ip + eps)                             particles to grid, each material by itself
     f_pj   = clip(x_p + j v_p + g j (j + 1) / 2, box)                        flight, j = 1 .. m; inelastic slip walls
-    (u_i1 .. u_im, b_i) = U-Net(density_i, vbar_i, accelerations_i, walls_i, density in flight_i)
+    (u_i1 .. u_im, b_i) = U-Net(density_i, vbar_i, accelerations_i, walls_i, density in flight_i)      for each material
     x_pj   = f_pj + sum_(k <= j) [ sum_i w_ip s_k u_ik + b_p (sum_i w_ip vbar_i - v_p) ],    b_p = sum_i w_ip b_i
+
+Materials that move have a density and a velocity field each, and a particle reads those of its own (as in NeuralMPM: where two meet, one field would
+make them one); kinematic particles, obstacles, are a density alone.
 
 The clip acts on the flight alone: nothing stops a wrong deviation from leaving the box, so escapes stay visible.
 """
@@ -255,6 +258,9 @@ class GridEmulator(nn.Module):
         self.register_buffer("corners", torch.tensor(list(itertools.product((0, 1), repeat=dim))), persistent=False)
         self.register_buffer("nodes", torch.tensor(nodes), persistent=False)
         self.register_buffer("types", torch.tensor(spec.particle_types), persistent=False)
+        # A data set may hold kinematic particles alone.
+        self.register_buffer("moving", torch.tensor([kind for kind in spec.particle_types if kind != KINEMATIC_TYPE] or [KINEMATIC_TYPE]),
+                             persistent=False)  # fmt: skip
         previewed = [max(round(share * m), 1) - 1 for share in settings.preview]
         self.register_buffer("previewed", torch.tensor(previewed, dtype=torch.int64), persistent=False)
         self.register_buffer("frame", torch.arange(1, m + 1)[:, None].float(), persistent=False)
@@ -263,8 +269,9 @@ class GridEmulator(nn.Module):
         if self.context:
             constant("context_mean", spec.context_mean)
             constant("context_std", np.maximum(spec.context_std, 1e-8))
-        inputs = len(spec.particle_types) + dim * (settings.history - 1) + 2 * dim + len(settings.preview) + self.context
-        self.network = SparseUNet(dim, inputs, settings.channels, m * dim + 1, settings.blocks)
+        materials = len(self.moving)
+        inputs = len(spec.particle_types) + materials * dim * (settings.history - 1) + 2 * dim + len(settings.preview) + self.context
+        self.network = SparseUNet(dim, inputs, settings.channels, materials * (m * dim + 1), settings.blocks)
 
     # ---- one call -------------------------------------------------------------------------------------------------------------------
 
@@ -288,8 +295,8 @@ class GridEmulator(nn.Module):
         return (value.index_select(0, row.reshape(-1)).view(*row.shape, -1) * weight[:, :, None]).sum(1)
 
     def node_features(self, node: Tensor, density: Tensor, velocity: Tensor, ahead: Tensor, context: Tensor | None) -> Tensor:
-        """[A, inputs] of the flat node ids [A], the density per type [A, types], the mean velocities [A, history - 1, d], newest first,
-        and the mean densities in flight [A, previews].
+        """[A, inputs] of the flat node ids [A], the density per type [A, types], the mean velocities [A, materials, history - 1, d], newest
+        first, and the mean densities in flight [A, previews].
 
         Density; newest velocity / velocity scale; its differences to the older ones / acceleration scale; signed distance to each wall
         in cells, clipped to +-wall_reach and divided by it; density in flight - 1; the normalised context of the node's example.
@@ -299,7 +306,8 @@ class GridEmulator(nn.Module):
         coordinate = (torch.div((node % size)[:, None], self.grid.stride0, rounding_mode="floor") % padded - 1).float()
         walls = torch.cat([coordinate - self.options.margin, self.nodes - 1 - self.options.margin - coordinate], 1)
         parts = [
-            density, velocity[:, 0] / self.velocity_scale, ((velocity[:, :-1] - velocity[:, 1:]) / self.acceleration_scale).flatten(1),
+            density, (velocity[:, :, 0] / self.velocity_scale).flatten(1),
+            ((velocity[:, :, :-1] - velocity[:, :, 1:]) / self.acceleration_scale).flatten(1),
             walls.clamp(-reach, reach) / reach, (ahead - 1).clamp(-1, 3),
         ]
         if self.context:
@@ -324,15 +332,20 @@ class GridEmulator(nn.Module):
         node, weight = self.weights(position, example)
         occupied, rows, levels = self.grid.occupy(node, examples)
         row = rows[node]
-        one_hot = (kind[:, None] == self.types).to(position.dtype)
+        one_hot, material = (kind[:, None] == self.types).to(position.dtype), (kind[:, None] == self.moving).to(position.dtype)
         ahead = self.density(flight.index_select(1, self.previewed).transpose(0, 1), example, examples)
-        sums = self.to_grid(torch.cat([one_hot, velocity.flatten(1), ahead], 1), row, weight, len(occupied))
-        mass, sums = sums.split((one_hot.shape[1], sums.shape[1] - one_hot.shape[1]), 1)
+        own = (material[:, :, None] * velocity.flatten(1)[:, None]).flatten(1)
+        sums = self.to_grid(torch.cat([one_hot, own, ahead], 1), row, weight, len(occupied))
+        mass, sums, ahead = sums.split((one_hot.shape[1], own.shape[1], ahead.shape[1]), 1)
         # Isolated particles leave nodes almost without mass: the constant keeps their gradients bounded.
-        mean, ahead = (sums / (mass.sum(1, keepdim=True) + 1e-3)).split((velocity.shape[1] * dim, ahead.shape[1]), 1)
-        mean = mean.view(-1, *velocity.shape[1:])
+        mean = sums.view(len(mass), len(self.moving), -1) / (mass[:, torch.isin(self.types, self.moving), None] + 1e-3)
+        ahead = ahead / (mass.sum(1, keepdim=True) + 1e-3)
+        mean = mean.view(*mean.shape[:2], *velocity.shape[1:])
         output = self.network(self.node_features(occupied, mass * self.particle_mass, mean, ahead, context), levels)
-        read = self.to_particles(torch.cat([output, mean[:, 0]], 1), row, weight)
+        fields = torch.cat([output.view(len(mass), len(self.moving), -1), mean[:, :, 0]], 2)
+        read = self.to_particles(fields.flatten(1), row, weight)
+        if len(self.moving) > 1:
+            read = (read.view(len(position), len(self.moving), -1) * material[:, :, None]).sum(1)
         deviation, blend, grid_velocity = read.split((m * dim, 1, dim), 1)
         deviation = deviation.view(-1, m, dim) * self.frame_scale[:, None] + (blend * (grid_velocity - velocity[:, 0]))[:, None]
         return (flight + deviation.cumsum(1)).transpose(0, 1)

@@ -172,6 +172,37 @@ def test_full_blend_gives_the_grid_velocity() -> None:
     assert np.allclose(step, velocity.mean(0), atol=1e-5)
 
 
+def test_two_materials_at_one_place_keep_their_velocities() -> None:
+    """b = 1: three particles at one place, two of water (5) and one of sand (6), each leave it with their own material's mean velocity; an obstacle
+    (3) there has no part in it."""
+    model = emulator({"history": 2}, particle_types=(3, 5, 6))
+    model.gravity.zero_()
+    with torch.no_grad():
+        model.network.leave.bias.view(2, -1)[:, -1] = 1.0
+    velocity = np.array([[0.002, 0.0], [-0.001, 0.004], [0.003, -0.002], [0.0, 0.0]], np.float32)
+    position = np.stack([np.full((4, 2), 0.42, np.float32) - velocity, np.full((4, 2), 0.42, np.float32)])
+    kinds = np.array([5, 5, 6, 3], np.int8)
+    model.begin(start(position, particle_type=kinds, kinematic=position[:, 3:]))
+    step = model.advance()[0] - position[1]
+    water = velocity[:2].mean(0)
+    # A lone particle's weights of 0.2 to 0.3 have 1e-3 added: 0.4 % of its velocity.
+    assert np.allclose(step, [water, water, velocity[2], [0, 0]], rtol=5e-3, atol=1e-6)
+
+
+def test_an_output_of_one_material_moves_that_alone() -> None:
+    model = emulator({"history": 2}, particle_types=(5, 6))
+    position = flight(6, 3)
+    kinds = np.array([5, 6, 5, 6, 6, 5], np.int8)
+    model.begin(start(position[:2], particle_type=kinds))
+    free = model.advance()
+    with torch.no_grad():
+        model.network.leave.bias.view(2, -1)[1, 0] = 1.0  # sand's deviation along x in the first frame
+    model.begin(start(position[:2], particle_type=kinds))
+    moved = model.advance()[0] - free[0]
+    expected = np.where((kinds == 6)[:, None], [float(model.frame_scale[0]), 0.0], 0.0)
+    assert np.allclose(moved, expected, atol=1e-7)
+
+
 def test_windows_grow_with_progress() -> None:
     model = emulator({"history": 3, "unroll": [1, 2, 4]})
     assert [model.window(progress) for progress in (0.0, 0.34, 0.67, 1.0)] == [7, 11, 19, 19]
@@ -270,7 +301,7 @@ def test_selection_prefers_windows_far_from_flight() -> None:
     batch = windows(position, examples=8)
     generator, seen = torch.Generator().manual_seed(0), np.zeros(8)
     for _ in range(120):
-        chosen = model._select(batch, generator)
+        chosen = model._select(batch, 2, generator)
         assert chosen.examples == 2 and chosen.position.shape[1] == 20
         seen[[int(((batch.position[0] - place).abs().sum(1)).argmin()) // 10 for place in chosen.position[0, ::10]]] += 1
     assert seen[3] > 75 and seen.min() > 8
