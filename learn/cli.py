@@ -18,7 +18,7 @@ def _train(arguments: argparse.Namespace) -> None:
 
     names = ("seed", "device", "threads", "minutes", "steps")
     overrides = {name: getattr(arguments, name) for name in names if getattr(arguments, name) is not None}
-    config = load_config(arguments.config, overrides)
+    config = load_config(arguments.config, overrides, arguments.variant)
     found = train(config, arguments.data, arguments.out, arguments.config)
     if found:
         print(json.dumps(found, indent=1, sort_keys=True))
@@ -86,6 +86,7 @@ def parser() -> argparse.ArgumentParser:
     train.add_argument("config", metavar="CONFIG", help="a file of configs/models/")
     train.add_argument("--data", required=True, metavar="DIR", help="data set with the splits train and valid")
     train.add_argument("--out", required=True, metavar="RUN", help="run folder")
+    train.add_argument("--variant", help="one of those that the file names")
     train.add_argument("--seed", type=int, help="instead of training.seed")
     train.add_argument("--device", choices=("auto", "cpu", "cuda"), help="instead of training.device")
     train.add_argument("--threads", type=int, help="instead of training.threads")

@@ -228,6 +228,36 @@ def kinetic_energy(rows: Sequence[dict], path: str | Path) -> None:
         _save(figure, path)
 
 
+#: Errors that a figure of ablations shows: as the paper's, of one step and of the whole rollout.
+ABLATED = (Yardstick("one_step_mse_moving", None), MOVING_MSE)
+
+
+def ablation(rows: Sequence[dict], axes: dict[str, dict[str, str | float]], path: str | Path) -> None:
+    """One-step and rollout error of trainings that differ in one thing: a column an axis (name -> contender -> its value there), a dot a training
+    seed, a line their median. A seed without an error, whose rollouts failed, is a cross at the top."""
+    found = {row["contender"]: row for row in rows}
+    _one_scene(rows)
+    with plt.rc_context(_STYLE):
+        size = (1.1 + 2.1 * len(axes), 5.4)
+        figure, panels = plt.subplots(len(ABLATED), len(axes), figsize=size, sharey="row", squeeze=False, layout="constrained")
+        for line, yardstick in zip(panels, ABLATED, strict=True):
+            for panel, (axis, models) in zip(line, axes.items(), strict=True):
+                values = [[yardstick.of(seed) for seed in found[model]["spread"]["per_seed"]] for model in models]
+                medians = [np.median([math.inf if value is None else value for value in seeds]) for seeds in values]
+                for place, seeds in enumerate(values):
+                    known = [value for value in seeds if value is not None]
+                    panel.plot([place] * len(known), known, "o", color=COLOURS["learned"], alpha=0.45, markersize=5, lw=0)
+                    if len(known) < len(seeds):
+                        panel.plot(place, 0.97, "x", color=COLOURS["reference"], transform=panel.get_xaxis_transform())
+                panel.plot(range(len(medians)), [value if math.isfinite(value) else math.nan for value in medians], color=COLOURS["learned"], lw=1.6)
+                panel.set(yscale="log", xlim=(-0.4, len(models) - 0.6))
+                panel.set_xticks(range(len(models)), [str(value) for value in models.values()])
+            line[0].set_ylabel(f"{yardstick}, length\u00b2".replace(" of moving particles", "").replace("rollout MSE over all frames", "rollout MSE"))
+        for panel, axis in zip(panels[-1], axes, strict=True):
+            panel.set_xlabel(axis)
+        _save(figure, path)
+
+
 def _read_columns(path: Path, columns: Sequence[str]) -> dict[str, np.ndarray]:
     """Columns of a CSV file as float arrays; ``InputError`` where the file, a column or a number is missing."""
     try:

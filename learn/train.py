@@ -37,6 +37,7 @@ from learn.checkpoint import STATE_KEYS, build_model, load_state, load_weights, 
 from learn.dataset import Dataset, DataSettings, Sampler, Windows
 from learn.metrics import frame_mse, spacing_ratio
 from learn.parallel import Processes
+from learn.variants import with_variant
 from sim import __version__
 from sim.errors import InputError, RunError
 from sim.simulator import rollout, start_from
@@ -109,8 +110,9 @@ class Config(BaseModel):
     data: DataSettings = DataSettings()
 
 
-def load_config(path: str | Path, overrides: dict | None = None) -> Config:
-    """Read and check a configuration file; ``overrides`` replace keys of ``training`` (a budget replaces the other kind of budget).
+def load_config(path: str | Path, overrides: dict | None = None, variant: str | None = None) -> Config:
+    """Read and check a configuration file; ``overrides`` replace keys of ``training`` (a budget replaces the other kind of budget), a ``variant`` of
+    those that the file names under ``variants`` keys of settings, training and data.
 
     Every fault is an ``InputError``. The model's own settings are checked when the model is built.
     """
@@ -123,6 +125,7 @@ def load_config(path: str | Path, overrides: dict | None = None) -> Config:
         raise InputError(path, "file", str(error), "not YAML; correct it") from None
     if not isinstance(content, dict):
         raise InputError(path, "file", type(content).__name__, "must be a mapping with the keys model, settings, training, data")
+    content = with_variant(content, variant, path)
     if overrides and isinstance(content.get("training"), dict):
         training = dict(content["training"])
         if {"steps", "minutes"} & set(overrides):

@@ -108,6 +108,7 @@ def assets(study: Study, summary: dict) -> dict[str, SceneAssets]:
             films=films,
             stills=[Asset(picture("strip.png"), "The same trajectory at six moments: teacher above, learned below.")] if films else [],
             figures=[
+                *([Asset(picture("ablation.svg"), "Ablations: each training a dot, their median a line.")] if entry["axes"] else []),
                 Asset(picture("error_over_run_time.svg"), "Error over run time, one thread each, the same machine."),
                 Asset(picture("error_over_time.svg"), "Error over time, with the chaos floor."),
                 Asset(picture("kinetic_energy.svg"), "Kinetic energy over time."),

@@ -19,6 +19,7 @@ from jsonschema.exceptions import ValidationError, relevance
 
 from learn.compare import BEST_TRIVIAL
 from learn.metrics import CLOUD_METRICS, CLOUD_TIMES
+from learn.variants import with_variant
 from sim.errors import InputError
 from sim.scene import SceneFamily, read_yaml
 from sim.stability import CASES
@@ -121,6 +122,7 @@ class Study:
         """All that a report shows of a comparison."""
         films = self.comparisons[comparison]["films"]
         names = [f"{model}.{suffix}" for model in films for suffix in ("mp4", "png")] + ["strip.png"] * bool(films)
+        names += ["ablation.svg"] * bool(self.comparisons[comparison]["axes"])
         names += [f"{figure}.svg" for figure in FIGURES] + ["training.svg"] * bool(self.training_runs(comparison))
         return [self.picture(comparison, name) for name in names]
 
@@ -218,7 +220,7 @@ def load_study(path: str | Path) -> Study:
             configs[name] = _config(path, content, name, entry)
     study = Study(path, content, families, configs)
     for name, entry in content["comparisons"].items():
-        content["comparisons"][name] = entry = {"horizons": [1, 5, 20, 100], "films": list(entry["learned"]), "targets": [], **entry}
+        content["comparisons"][name] = entry = {"horizons": [1, 5, 20, 100], "films": list(entry["learned"]), "targets": [], "axes": {}, **entry}
         entry["timing"] = {"repeats": 5, **entry["timing"]}
         _check_comparison(study, name, entry)
     scenes = [families[entry["data"]].model.name for entry in content["comparisons"].values()]
@@ -246,6 +248,8 @@ def _config(path: Path, content: dict, name: str, entry: dict) -> dict:
     model = config.get("model") if isinstance(config, dict) else None
     if model not in registered_models():
         raise InputError(entry["config"], "model", model, f"must be one of {', '.join(sorted(registered_models()))}")
+    if "variant" in entry or "variants" in config:
+        config = with_variant(config, entry.get("variant"), entry["config"])
     if not isinstance(config.get("training"), dict):
         raise InputError(entry["config"], "training", config.get("training"), "must be a mapping with a budget; see configs/models/")
     data = content["data"].get(entry["data"])
@@ -274,6 +278,10 @@ def _check_comparison(study: Study, name: str, entry: dict) -> None:
             raise InputError(path, f"{where}.ladder[{index}].name", rung["name"], "another contender has this name; rename the rung")
         if rung.get("coarsen", 1) != 1 and rung.get("particles") != "recorded":
             raise InputError(path, f"{where}.ladder[{index}].coarsen", rung["coarsen"], "a coarser grid needs particles: recorded")
+    for axis, models in entry["axes"].items():
+        for model in models:
+            if model not in entry["learned"]:
+                raise InputError(path, f"{where}.axes.{axis}", model, f"not among the learned: {', '.join(entry['learned']) or 'none'}")
     for index, target in enumerate(entry["targets"]):
         for key in ("contender", "relative_to"):
             if key in target and target[key] not in [*names, BEST_TRIVIAL]:

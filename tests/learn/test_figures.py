@@ -43,6 +43,24 @@ def kept(monkeypatch):
     plt.close("all")
 
 
+def test_ablation_shows_every_training_and_medians(tmp_path, kept):
+    def ablated(name, errors):
+        seeds = [{"seed": k, "one_step_mse_moving": 1e-9 if e else None, "rollout_mse_moving": {"all": e}} for k, e in enumerate(errors)]
+        found = row(name, "learned", 1e-5, 1e-3)
+        return found | {"spread": found["spread"] | {"per_seed": seeds}}
+
+    rows = [*ROWS, ablated("base", [1e-4, 3e-4, 2e-4]), ablated("small", [4e-3, None, 1e-3]), ablated("shared", [2e-4, 2e-4, 5e-4])]
+    figures.ablation(rows, {"steps": {"small": 1, "base": 5}, "blocks": {"base": "own", "shared": "one"}}, tmp_path / "figure.svg")
+    one_step, rollout = kept[0].axes[:2], kept[0].axes[2:]
+    assert len(one_step) == len(rollout) == 2
+    dots = [sorted(line.get_ydata()) for line in rollout[0].lines if line.get_linestyle() == "None" and line.get_marker() == "o"]
+    assert dots == [[1e-3, 4e-3], [1e-4, 2e-4, 3e-4]]
+    # The median of a failure and two errors is the larger one.
+    assert [line.get_ydata().tolist() for line in rollout[0].lines if line.get_linestyle() == "-"] == [[4e-3, 2e-4]]
+    assert sum(line.get_marker() == "x" for line in rollout[0].lines) == 1
+    assert [label.get_text() for label in rollout[1].get_xticklabels()] == ["own", "one"] and rollout[0].get_xlabel() == "steps"
+
+
 def test_error_over_run_time(tmp_path, kept):
     path = tmp_path / "figure.png"
     figures.error_over_run_time(ROWS, path)

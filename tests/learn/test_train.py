@@ -389,6 +389,18 @@ def write(path: Path, content: object) -> Path:
 GOOD = {"model": "dummy", "settings": {"noise": 0.1}, "training": {"steps": 5}, "data": {"stride": 2}}
 
 
+def test_variants_change_what_they_name(tmp_path: Path) -> None:
+    path = write(tmp_path / "c.yaml", {**GOOD, "variants": {"quiet": {"settings": {"noise": 0.0}, "training": {"batch": 7}, "data": {"stride": 3}}}})
+    plain, quiet = load_config(path), load_config(path, variant="quiet")
+    assert plain == load_config(write(tmp_path / "d.yaml", GOOD))
+    assert quiet.settings == {**plain.settings, "noise": 0.0} and quiet.data.stride == 3
+    assert quiet.training == plain.training.model_copy(update={"batch": 7})
+    for variants, key, said in ((GOOD | {"variants": {"quiet": {}}}, "loud", "quiet"), (GOOD, "loud", "there are none"),
+                                (GOOD | {"variants": [1]}, None, "must map"), (GOOD | {"variants": {"a": 3}}, None, "must map")):  # fmt: skip
+        with pytest.raises(InputError, match=said):
+            load_config(write(tmp_path / "c.yaml", variants), variant=key)
+
+
 def test_load_config(tmp_path: Path) -> None:
     loaded = load_config(write(tmp_path / "c.yaml", GOOD), {"minutes": 2.0, "seed": 4})
     assert loaded.training.steps is None and loaded.training.minutes == 2.0 and loaded.training.seed == 4 and loaded.data.stride == 2

@@ -81,6 +81,9 @@ MISTAKES = [
     (drop(*COMPARISON, "targets", 0, "at"), "targets[0].at = None: rollout_mse_moving is known at"),
     (put(*COMPARISON, "targets", 0, "metric", value="emd"), "targets[0].at = 'all': emd is known at 0.25, 0.5, 0.75, 1"),
     (put(*COMPARISON, "targets", 0, "metric", value="escaped_fraction"), "targets[0].at = 'all': escaped_fraction is one figure; leave it out"),
+    (put(*COMPARISON, "axes", value={"size": {"gns": 1, "gsn": 2}}), "comparisons.puddle.axes.size = 'gsn': not among the learned: gns"),
+    (put(*COMPARISON, "axes", value={"size": {"gns": 1}}), "comparisons.puddle.axes.size = ['gns']"),
+    (put("models", "gns", "variant", value="big"), "variant = 'big': not among the variants (there are none)"),
     (put("stability", value={"a": ["rest"]}), "a study of stability has title and stability alone"),
     (lambda content: content["comparisons"].update(again=content["comparisons"]["puddle"]), "two comparisons share this one"),
 ]
@@ -145,7 +148,9 @@ def test_shipped_studies_resolve(place, name):
     jobs = planned(place, study=f"configs/studies/{name}.yaml")
     content = yaml.safe_load((place / "configs" / "studies" / f"{name}.yaml").read_text())
     comparisons, models = content["comparisons"].values(), content["models"].values()
-    assert all(len(entry["ladder"]) >= 5 for entry in comparisons)
+    # Ablations compare learned models with each other.
+    assert all(len(entry["ladder"]) >= (1 if "axes" in entry else 5) for entry in comparisons)
+    assert jobs.get("ablation", 0) == sum("axes" in entry for entry in comparisons)
     assert jobs["errors"] == jobs["timing"] == jobs["figures"] == len(comparisons) and jobs["report"] == 1
     assert jobs.get("train", 0) == sum(len(model.get("seeds", [])) for model in models)
 

@@ -102,6 +102,27 @@ rule figures:
         "{PYTHON} -m workflow.scripts.figures {input.rows} {input.timing} {output} > {log} 2>&1"
 
 
+rule ablation:
+    input:
+        rows=f"{RESULTS}/comparisons/{{comparison}}/errors.json",
+    output:
+        f"{RESULTS}/pictures/{{comparison}}/ablation.svg",
+    params:
+        code=lambda wildcards: STUDY.comparison_recipe(wildcards.comparison, ("axes",), "ablation"),
+    log:
+        f"{RESULTS}/logs/ablation/{{comparison}}.log",
+    benchmark:
+        f"{RESULTS}/benchmarks/ablation/{{comparison}}.tsv"
+    threads: 1
+    resources:
+        mem_mb=2000,
+        runtime=10,
+    message:
+        "Figure of the ablations on {wildcards.comparison}"
+    shell:
+        "{PYTHON} -m workflow.scripts.ablation {STUDY.path} {wildcards.comparison} {input.rows} {output} > {log} 2>&1"
+
+
 rule training_curve:
     input:
         learned_models,

@@ -17,6 +17,7 @@ rule train:
         run=lambda wildcards: STUDY.run_folder(wildcards.model, wildcards.seed),
         config=lambda wildcards: STUDY.models[wildcards.model]["config"],
         data=lambda wildcards: STUDY.data_folder(STUDY.models[wildcards.model]["data"], "learning"),
+        variant=lambda wildcards: "".join(f"--variant {name}" for name in [STUDY.models[wildcards.model].get("variant")] if name),
         budget=lambda wildcards: " ".join(f"--{key} {value}" for key, value in STUDY.budget(wildcards.model).items()),
     log:
         f"{RESULTS}/logs/train/{{model}}-{{seed}}.log",
@@ -32,5 +33,6 @@ rule train:
         "Training {wildcards.model}, seed {wildcards.seed} (progress in {log})"
     shell:
         "( {PYTHON} -m workflow.scripts.keep {params.run} {params.recipe} --"
-        " {PYTHON} -m learn train {params.config} --data {params.data} --out {params.run} --seed {wildcards.seed} --threads {threads} {params.budget}"
+        " {PYTHON} -m learn train {params.config} --data {params.data} --out {params.run} --seed {wildcards.seed} --threads {threads} {params.variant}"
+        " {params.budget}"
         " && cp {params.run}/best.pt {output.model} && cp {params.run}/done.json {output.done} ) > {log} 2>&1"
