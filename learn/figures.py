@@ -241,7 +241,7 @@ def ablation(rows: Sequence[dict], axes: dict[str, dict[str, str | float]], path
         size = (1.1 + 2.1 * len(axes), 5.4)
         figure, panels = plt.subplots(len(ABLATED), len(axes), figsize=size, sharey="row", squeeze=False, layout="constrained")
         for line, yardstick in zip(panels, ABLATED, strict=True):
-            for panel, (axis, models) in zip(line, axes.items(), strict=True):
+            for panel, models in zip(line, axes.values(), strict=True):
                 values = [[yardstick.of(seed) for seed in found[model]["spread"]["per_seed"]] for model in models]
                 medians = [np.median([math.inf if value is None else value for value in seeds]) for seeds in values]
                 for place, seeds in enumerate(values):
