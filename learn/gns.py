@@ -46,6 +46,7 @@ class Settings(BaseModel):
     hidden_layers: int = Field(2, ge=1)  # hidden layers of every MLP
     message_passing: int = Field(10, ge=1)  # M, blocks of the processor
     shared: bool = False  # one block, used M times
+    edge_update: bool = True  # blocks update the edges as well, e += m; without it they see the encoded edges alone, as in a port's older models
     history: int = Field(5, ge=1)  # C, velocities the model is given; the noise walks along all of them
     inputs: InputScaling = "velocity"  # what is made of them, see learn.features.Features; "acceleration" serves sparse impacts
     relative_velocity: bool = False  # relative velocity among the edge features
@@ -116,8 +117,9 @@ def _bag_sum(values: Tensor, order: Tensor, offsets: Tensor) -> Tensor:
     return torch.embedding_bag(values, order, offsets, mode=0, include_last_offset=True)[0]
 
 
-def _edge_pass(graph: Graph, dtype: torch.dtype, table: Tensor, edges: Tensor, first: Tensor, rest: tuple[Tensor, ...], keep: bool):
-    """Messages m = MLP[e, v_r, v_s], their sums over each receiver's edges, and e + m, one run of edges after the other.
+def _edge_pass(graph: Graph, dtype: torch.dtype, table: Tensor, edges: Tensor, first: Tensor, rest: tuple[Tensor, ...], update: bool,
+               keep: bool):
+    """Messages m = MLP[e, v_r, v_s], their sums over each receiver's edges, and e + m (None without ``update``), one run of edges after the other.
 
     table [particles, 2, latent]: the particles' share of the first layer, as receiver (bias included) and as sender; edges
     [edges, latent]; first [latent, latent]: the edges' share of the first weight; rest: as ``MLP.rest``. Returns sums [particles, latent]
@@ -130,7 +132,7 @@ def _edge_pass(graph: Graph, dtype: torch.dtype, table: Tensor, edges: Tensor, f
     count, latent = len(edges) if keep else max(len(run.order) for run in graph.runs), len(gamma)
     hidden = [edges.new_empty(count, latent) for _ in weights]
     z, mean, rstd = edges.new_empty(count, latent), gamma.new_empty(count, 1), gamma.new_empty(count, 1)
-    updated = torch.empty_like(edges) if keep else edges
+    updated = None if not update else torch.empty_like(edges) if keep else edges
     sums = gamma.new_empty(graph.particles, latent)
     twos = torch.arange(0, 2 * max(len(run.order) for run in graph.runs) + 1, 2, dtype=torch.int32, device=edges.device)
     for run in graph.runs:
@@ -144,20 +146,21 @@ def _edge_pass(graph: Graph, dtype: torch.dtype, table: Tensor, edges: Tensor, f
         x = x if x.device.type == "cpu" else x.to(gamma.dtype)  # the CPU's kernel takes bf16 with weights in f32, and is spared a copy
         message, mean[kept], rstd[kept] = torch.native_layer_norm(x, (latent,), gamma, beta, NORM_EPSILON)
         sums[run.receivers] = _bag_sum(message, run.order, run.offsets)
-        torch.add(edges[run.edges], message.to(dtype), out=updated[run.edges])
+        if update:
+            torch.add(edges[run.edges], message.to(dtype), out=updated[run.edges])
     return sums, updated, (*hidden, z, mean, rstd)
 
 
-def _edge_pass_in_place(graph: Graph, dtype: torch.dtype, table: Tensor, edges: Tensor, first: Tensor, *rest: Tensor) -> tuple[Tensor, Tensor]:
-    return _edge_pass(graph, dtype, table, edges, first, rest, keep=False)[:2]
+def _edge_pass_in_place(graph: Graph, dtype: torch.dtype, update: bool, table: Tensor, edges: Tensor, first: Tensor, *rest: Tensor):
+    return _edge_pass(graph, dtype, table, edges, first, rest, update, keep=False)[:2]
 
 
 class _EdgeUpdate(torch.autograd.Function):
     """``_edge_pass`` with its gradient, run by run as well."""
 
     @staticmethod
-    def forward(ctx, graph: Graph, dtype: torch.dtype, table: Tensor, edges: Tensor, first: Tensor, *rest: Tensor):
-        sums, updated, kept = _edge_pass(graph, dtype, table, edges, first, rest, keep=True)
+    def forward(ctx, graph: Graph, dtype: torch.dtype, update: bool, table: Tensor, edges: Tensor, first: Tensor, *rest: Tensor):
+        sums, updated, kept = _edge_pass(graph, dtype, table, edges, first, rest, update, keep=True)
         ctx.graph, ctx.dtype, ctx.layers = graph, dtype, len(rest) // 2 - 1
         ctx.set_materialize_grads(False)
         ctx.save_for_backward(edges, first, *rest, *kept)
@@ -197,17 +200,17 @@ class _EdgeUpdate(torch.autograd.Function):
             grad_table[run.receivers, 0] = _bag_sum(gradient, run.order, run.offsets)
         grad_table[:, 1] = _bag_sum(grad_input, graph.reverse, graph.offsets)
         layers = [gradient for pair in zip(grad_weights, grad_biases, strict=True) for gradient in pair]
-        return None, None, grad_table, grad_edges, grad_first, *layers, grad_gamma, grad_beta
+        return None, None, None, grad_table, grad_edges, grad_first, *layers, grad_gamma, grad_beta
 
 
 class Interaction(nn.Module):
-    """One block of message passing: m = MLP_e[e, v_r, v_s], v += MLP_v[sum of m over incoming edges, v], e += m."""
+    """One block of message passing: m = MLP_e[e, v_r, v_s], v += MLP_v[sum of m over incoming edges, v], e += m if ``edge_update``."""
 
-    def __init__(self, latent: int, hidden_layers: int):
+    def __init__(self, latent: int, hidden_layers: int, edge_update: bool):
         super().__init__()
         self.edge = MLP(3 * latent, latent, hidden_layers, latent)
         self.node = MLP(2 * latent, latent, hidden_layers, latent)
-        self.latent = latent
+        self.latent, self.edge_update = latent, edge_update
 
     def forward(self, nodes: Tensor, edges: Tensor, graph: Graph, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
         """nodes [particles, latent], edges [edges, latent] -> both, updated."""
@@ -216,10 +219,10 @@ class Interaction(nn.Module):
         weight = torch.cat([edge.weight[:, d : 2 * d], edge.weight[:, 2 * d :]])
         table = _linear(nodes, weight, F.pad(edge.bias, (0, d)), dtype).view(-1, 2, d)
         step = _EdgeUpdate.apply if torch.is_grad_enabled() else _edge_pass_in_place
-        sums, edges = step(graph, dtype, table, edges, edge.weight[:, :d], *self.edge.rest())
+        sums, updated = step(graph, dtype, self.edge_update, table, edges, edge.weight[:, :d], *self.edge.rest())
         own = _linear(nodes, node.weight[:, d:], node.bias, dtype)
         update = self.node.finish(own + _linear(sums, node.weight[:, :d], None, dtype), dtype)
-        return nodes + update, edges
+        return nodes + update, edges if updated is None else updated
 
 
 class Network(nn.Module):
@@ -231,7 +234,7 @@ class Network(nn.Module):
         self.encode_node = MLP(node_width, latent, hidden, latent)
         self.encode_edge = MLP(edge_width, latent, hidden, latent)
         self.repeats = settings.message_passing if settings.shared else 1
-        self.processor = nn.ModuleList(Interaction(latent, hidden) for _ in range(settings.message_passing // self.repeats))
+        self.processor = nn.ModuleList(Interaction(latent, hidden, settings.edge_update) for _ in range(settings.message_passing // self.repeats))
         self.decode = MLP(latent, latent, hidden, dim, norm=False)
         self.low_precision = settings.precision == "bf16"
 

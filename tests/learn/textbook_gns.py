@@ -27,5 +27,5 @@ class TextbookNetwork(nn.Module):
                 message = mlp(block.edge, torch.cat([edges, nodes[receiver], nodes[sender]], 1))
                 total = torch.zeros_like(nodes).index_add(0, receiver, message)
                 nodes = nodes + mlp(block.node, torch.cat([total, nodes], 1))
-                edges = edges + message
+                edges = edges + message if block.edge_update else edges
         return mlp(self.network.decode, nodes)
