@@ -26,25 +26,41 @@ TYPE_SLOTS, TYPE_WIDTH = 9, 16
 SMALLEST_STD = 1e-8
 
 InputScaling = Literal["velocity", "acceleration", "last"]
+NoiseScheme = Literal["random_walk", "uncorrelated", "correlated", "last"]
 
 
 def random_walk_noise(
     position: Tensor, sigma: float | Tensor, generator: torch.Generator, moving: Tensor | None = None, place: tuple[int, int] | None = None
 ) -> Tensor:
-    """Noise for a window of positions whose velocities have done a random walk; [frames, particles, dim], zero in the first frame.
+    """``velocity_noise`` as the paper has it."""
+    return velocity_noise("random_walk", position, sigma, generator, moving, place)
 
-    Each of the C = frames - 1 velocities adds N(0, sigma^2 / C) per axis, summed along the window, so that the last velocity's noise
-    has standard deviation ``sigma`` [length / frame] (a number, or [dim]); summed once more into positions. Particles outside
-    ``moving`` [particles] get none.
+
+def velocity_noise(
+    scheme: NoiseScheme, position: Tensor, sigma: float | Tensor, generator: torch.Generator, moving: Tensor | None = None,
+    place: tuple[int, int] | None = None,
+) -> Tensor:
+    """Noise for a window of positions, summed up from noise of its C = frames - 1 velocities; [frames, particles, dim], zero in the first frame.
+
+    By the paper's four schemes, in each of which the last velocity's noise is N(0, sigma^2) per axis, sigma [length / frame] (a number, or
+    [dim]): "random_walk", every velocity adds N(0, sigma^2 / C) to the noise of the one before; "uncorrelated", every velocity has a draw of
+    its own; "correlated", all have the same; "last", the last velocity alone. Particles outside ``moving`` [particles] get none.
     Drawn on the CPU, so that a seed means the same noise on every device; and for the whole batch of which these particles are a process's share
     (``place``: ``Windows.place``), so that it means the same on any number of processes.
     """
     frames, particles, dim = position.shape
     first, whole = place or (0, particles)
-    steps = torch.randn((frames - 1, whole, dim), generator=generator, dtype=torch.float32)[:, first : first + particles]
-    steps = steps * (sigma / math.sqrt(frames - 1))
-    steps = steps.to(position)
-    noise = torch.cat([torch.zeros_like(position[:1]), steps.cumsum(0).cumsum(0)])
+    draws = frames - 1 if scheme in ("random_walk", "uncorrelated") else 1
+    velocity = torch.randn((draws, whole, dim), generator=generator, dtype=torch.float32)[:, first : first + particles]
+    velocity = velocity * (sigma / math.sqrt(frames - 1) if scheme == "random_walk" else sigma)
+    velocity = velocity.to(position)
+    if scheme == "random_walk":
+        velocity = velocity.cumsum(0)
+    elif scheme == "correlated":
+        velocity = velocity.expand(frames - 1, -1, -1)
+    elif scheme == "last":
+        velocity = torch.cat([torch.zeros_like(position[2:]), velocity])
+    noise = torch.cat([torch.zeros_like(position[:1]), velocity.cumsum(0)])
     return noise if moving is None else noise * moving[:, None]
 
 

@@ -24,7 +24,7 @@ from pydantic import BaseModel, ConfigDict, Field, PositiveInt, model_validator
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from learn.features import Features, InputScaling, random_walk_noise
+from learn.features import Features, InputScaling, NoiseScheme, velocity_noise
 from learn.graph import Graph, radius_graph
 from learn.relaxation import Relaxation, relax
 from sim.simulator import SimulationError, Start
@@ -47,13 +47,14 @@ class Settings(BaseModel):
     message_passing: int = Field(10, ge=1)  # M, blocks of the processor
     shared: bool = False  # one block, used M times
     edge_update: bool = True  # blocks update the edges as well, e += m; without it they see the encoded edges alone, as in a port's older models
-    history: int = Field(5, ge=1)  # C, velocities the model is given; the noise walks along all of them
+    history: int = Field(5, ge=1)  # C, velocities the model is given; the noise is on all of them
     inputs: InputScaling = "velocity"  # what is made of them, see learn.features.Features; "acceleration" serves sparse impacts
     relative_velocity: bool = False  # relative velocity among the edge features
     radius: float | None = Field(None, gt=0)  # connectivity radius in particle spacings; None: the data's
     wall_distance: float | None = Field(None, gt=0)  # clamp of the wall distances in particle spacings; None: the connectivity radius
     noise: float = Field(0.3, ge=0)  # sigma of the last velocity's noise (the paper's 6.7e-4 is .25-.5 of its velocity std)
     noise_unit: Literal["velocity_std", "absolute"] = "velocity_std"  # of ``noise``: rms velocity std over the axes, or length / model frame
+    noise_scheme: NoiseScheme = "random_walk"  # see learn.features.velocity_noise
     ballistic: bool = False  # predictions start from gravity * dt^2 instead of the mean acceleration
     walls: bool = False  # with ``ballistic``: that flight stops at the walls; nothing stops a wrong prediction, so escapes stay visible
     unroll: tuple[PositiveInt, ...] = Field((1,), min_length=1)  # calls the loss is unrolled over, in equal shares of the training: (1, 2, 4)
@@ -282,14 +283,14 @@ class GNS(nn.Module):
     def loss(self, windows: Windows, generator: torch.Generator, progress: float) -> Tensor:
         """Squared error of the normalised acceleration, summed over axes, averaged over particles that move.
 
-        The window's input gets a random-walk noise; the target is the acceleration that brings the *noisy* last velocity to the true
+        The window's input gets noise (``noise_scheme``); the target is the acceleration that brings the *noisy* last velocity to the true
         next one (later positions are shifted by the last position's noise). Unrolled over several calls, call j is judged by its
         position: error / (acceleration std * j (j + 1) / 2), the number of times an acceleration error has entered it by then; the
         mean over the calls is returned, which for one call is the paper's loss.
         """
         given = self.velocities + 1
         moving = self.features.moving(windows.particle_type)
-        noise = random_walk_noise(windows.position[:given], self.sigma, generator, moving, windows.place)
+        noise = velocity_noise(self.options.noise_scheme, windows.position[:given], self.sigma, generator, moving, windows.place)
         position = windows.position[:given] + noise
         total = position.new_zeros(())
         calls = len(windows.position) - given
