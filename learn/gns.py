@@ -50,6 +50,7 @@ class Settings(BaseModel):
     history: int = Field(5, ge=1)  # C, velocities the model is given; the noise is on all of them
     inputs: InputScaling = "velocity"  # what is made of them, see learn.features.Features; "acceleration" serves sparse impacts
     relative_velocity: bool = False  # relative velocity among the edge features
+    self_edges: bool = True  # every particle also sends to itself
     radius: float | None = Field(None, gt=0)  # connectivity radius in particle spacings; None: the data's
     wall_distance: float | None = Field(None, gt=0)  # clamp of the wall distances in particle spacings; None: the connectivity radius
     noise: float = Field(0.3, ge=0)  # sigma of the last velocity's noise (the paper's 6.7e-4 is .25-.5 of its velocity std)
@@ -296,7 +297,7 @@ class GNS(nn.Module):
         calls = len(windows.position) - given
         for call in range(1, calls + 1):
             context = windows.context[given + call - 2][windows.example] if self.features.context else None
-            graph = radius_graph(position[-1], self.radius, windows.example)
+            graph = radius_graph(position[-1], self.radius, windows.example, self.options.self_edges)
             output = self._predict(position, graph, windows.particle_type, self.features.bounds, context)
             following = windows.position[given + call - 1] + noise[-1]
             error = (output - self.features.target(position, following)) / (call * (call + 1) / 2)
@@ -314,7 +315,8 @@ class GNS(nn.Module):
     def _predict(self, position: Tensor, graph: Graph, particle_type: Tensor, bounds: Tensor, context: Tensor | None) -> Tensor:
         output = self.network(self.features.nodes(position, particle_type, bounds, context), self.features.edges(position, graph), graph)
         if self.options.flight_below:
-            output = output * (graph.offsets.diff() > self.options.flight_below)[:, None]  # every particle has its self edge as well
+            neighbours = graph.offsets.diff() - int(self.options.self_edges)
+            output = output * (neighbours >= self.options.flight_below)[:, None]
         return output
 
     def begin(self, start: Start) -> None:
@@ -349,8 +351,8 @@ class GNS(nn.Module):
         if self.features.context:
             row = torch.as_tensor(start.context[min(self._present, len(start.context) - 1)], device=self._position.device)
             context = row.expand(count, -1)
-        graph = radius_graph(self._position[-1], self.radius)
-        self._first_edges = self._first_edges or graph.edges
+        graph = radius_graph(self._position[-1], self.radius, self_edges=self.options.self_edges)
+        self._first_edges = self._first_edges or max(graph.edges, count)  # without self edges there may be none at first
         if graph.edges > self.options.edge_cap * self._first_edges:
             raise SimulationError(f"particles clump: {graph.edges} edges, {self.options.edge_cap:g} x the {self._first_edges} of the start exceeded")
         output = self._predict(self._position, graph, self._type, self._bounds, context)
