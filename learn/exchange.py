@@ -47,7 +47,10 @@ _EMBEDDING = "_particle_type_embedding.weight"
 _FIRST = f"{_ROOT}_encoder.node_fn.0.NN-0."  # the first layer of the node encoder
 
 #: What the port does not have, by the settings that leave it out.
-_PUBLISHED = {"inputs": "velocity", "relative_velocity": False, "self_edges": True, "walls": False, "flight_below": 0, "relaxation": None}
+_PUBLISHED = {
+    "inputs": "velocity", "encoder": "relative", "relative_velocity": False, "self_edges": True, "walls": False, "flight_below": 0,
+    "relaxation": None,
+}
 
 Positive = Annotated[FiniteFloat, Field(gt=0)]
 

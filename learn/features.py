@@ -71,15 +71,17 @@ class Features(nn.Module):
     sqrt(std^2 + sigma^2); velocities: C, how many past velocities are seen; radius: of the connectivity [length]; wall_distance: where
     the distances to the walls are clamped [length]; scaling: "velocity", C velocities by velocity std (the paper); "acceleration", the
     last velocity by velocity std and the C - 1 past accelerations by acceleration std; "last", the last velocity alone;
-    relative_velocity: v_sender - v_receiver on the edges; ballistic: predictions start from gravity * dt^2, not from the mean acceleration;
-    walls: that flight stops at the walls (slips along them), as the grid emulator's does, so that the stop need not be learnt.
+    absolute: places in the training data's box on the nodes and nothing on the edges (the paper's absolute encoder; the other one knows
+    relative places alone); relative_velocity: v_sender - v_receiver on the edges; ballistic: predictions start from gravity * dt^2, not from
+    the mean acceleration; walls: that flight stops at the walls (slips along them), as the grid emulator's does, so that the stop need not
+    be learnt.
     """
 
     def __init__(self, spec: DataSpec, *, sigma: float, velocities: int, radius: float, wall_distance: float, scaling: InputScaling,
-                 relative_velocity: bool, ballistic: bool, walls: bool = False):
+                 relative_velocity: bool, ballistic: bool, walls: bool = False, absolute: bool = False):
         super().__init__()
         self.velocities, self.radius, self.wall_distance = velocities, radius, wall_distance
-        self.scaling, self.relative_velocity, self.walls = scaling, relative_velocity, walls
+        self.scaling, self.relative_velocity, self.walls, self.absolute = scaling, relative_velocity, walls, absolute
         step = spec.frame_step * spec.stride
         base = [g * step * step for g in spec.gravity] if ballistic else spec.acceleration_mean
 
@@ -104,14 +106,16 @@ class Features(nn.Module):
             constant("context_std", [max(s, SMALLEST_STD) for s in spec.context_std])
         shown = 1 if scaling == "last" else velocities
         self.node_width = (shown + 2) * spec.dim + (TYPE_WIDTH if self.embedding else 0) + (len(spec.context_mean) if self.context else 0)
-        self.edge_width = spec.dim + 1 + (spec.dim if relative_velocity else 0)
+        self.node_width += spec.dim if absolute else 0
+        self.edge_width = 0 if absolute else spec.dim + 1 + (spec.dim if relative_velocity else 0)
 
     def moving(self, particle_type: Tensor) -> Tensor | None:
         """[particles] bool, or None where the data have no kinematic particle."""
         return particle_type != KINEMATIC_TYPE if self.kinematic else None
 
     def nodes(self, position: Tensor, particle_type: Tensor, bounds: Tensor, context: Tensor | None = None) -> Tensor:
-        """[particles, node_width]: motion (oldest first), clip(distance to lower and upper walls / wall_distance, -1, 1), type embedding, context.
+        """[particles, node_width]: motion (oldest first), clip(distance to lower and upper walls / wall_distance, -1, 1), type embedding, context,
+        and for the absolute encoder the place, -1 to 1 along every axis of the training data's box.
 
         position [C + 1, particles, dim], length; particle_type [particles] int64; bounds [dim, 2], length; context [particles, c].
         """
@@ -129,13 +133,18 @@ class Features(nn.Module):
             columns.append(self.embedding(particle_type))
         if self.context:
             columns.append((context - self.context_mean) / self.context_std)
+        if self.absolute:
+            columns.append(2 * (position[-1] - self.bounds[:, 0]) / (self.bounds[:, 1] - self.bounds[:, 0]) - 1)
         return torch.cat([column.to(self.velocity_std.dtype) for column in columns], 1)
 
     def edges(self, position: Tensor, graph: Graph) -> Tensor:
         """[edges, edge_width]: (x_sender - x_receiver) / radius, its norm, and optionally (v_sender - v_receiver) / velocity std.
 
-        position [C + 1, particles, dim], length.
+        position [C + 1, particles, dim], length. The absolute encoder sees none.
         """
+        if self.absolute:
+            return self.velocity_std.new_empty(graph.edges, 0)
+
         def difference(values: Tensor) -> Tensor:
             return values.index_select(0, graph.sender) - values.index_select(0, graph.receiver)
 

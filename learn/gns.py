@@ -49,6 +49,7 @@ class Settings(BaseModel):
     edge_update: bool = True  # blocks update the edges as well, e += m; without it they see the encoded edges alone, as in a port's older models
     history: int = Field(5, ge=1)  # C, velocities the model is given; the noise is on all of them
     inputs: InputScaling = "velocity"  # what is made of them, see learn.features.Features; "acceleration" serves sparse impacts
+    encoder: Literal["relative", "absolute"] = "relative"  # absolute: places in the box on the nodes, a learnt constant on the edges
     relative_velocity: bool = False  # relative velocity among the edge features
     self_edges: bool = True  # every particle also sends to itself
     radius: float | None = Field(None, gt=0)  # connectivity radius in particle spacings; None: the data's
@@ -70,11 +71,13 @@ class Settings(BaseModel):
     edge_cap: float = Field(4.0, gt=1)  # a rollout fails when its edges exceed this multiple of their first number (it clumps)
 
     @model_validator(mode="after")
-    def _walls_stop_flight(self) -> Settings:
+    def _go_together(self) -> Settings:
         if self.walls and not self.ballistic:
             raise ValueError("walls stops the ballistic flight; set ballistic: true with it")
         if self.flight_below and not self.ballistic:
             raise ValueError("flight_below means ballistic flight; set ballistic: true with it")
+        if self.relative_velocity and self.encoder == "absolute":
+            raise ValueError("relative_velocity is a feature of the edges, which the absolute encoder does not see; set encoder: relative")
         return self
 
 
@@ -234,7 +237,8 @@ class Network(nn.Module):
         super().__init__()
         latent, hidden = settings.latent, settings.hidden_layers
         self.encode_node = MLP(node_width, latent, hidden, latent)
-        self.encode_edge = MLP(edge_width, latent, hidden, latent)
+        absolute = settings.encoder == "absolute"
+        self.encode_edge = nn.Parameter(torch.zeros(latent)) if absolute else MLP(edge_width, latent, hidden, latent)
         self.repeats = settings.message_passing if settings.shared else 1
         self.processor = nn.ModuleList(Interaction(latent, hidden, settings.edge_update) for _ in range(settings.message_passing // self.repeats))
         self.decode = MLP(latent, latent, hidden, dim, norm=False)
@@ -244,7 +248,10 @@ class Network(nn.Module):
         """nodes [particles, node_width], edges [edges, edge_width] -> [particles, dim]."""
         dtype = torch.bfloat16 if self.low_precision else nodes.dtype
         nodes = self.encode_node(nodes, dtype)
-        edges = torch.cat([self.encode_edge(edges[run.edges], dtype).to(dtype) for run in graph.runs])
+        if isinstance(self.encode_edge, nn.Parameter):
+            edges = self.encode_edge.to(dtype).repeat(graph.edges, 1)
+        else:
+            edges = torch.cat([self.encode_edge(edges[run.edges], dtype).to(dtype) for run in graph.runs])
         for _ in range(self.repeats):
             for block in self.processor:
                 nodes, edges = block(nodes, edges, graph, dtype)
@@ -269,7 +276,7 @@ class GNS(nn.Module):
         self.features = Features(
             spec, sigma=self.sigma, velocities=self.velocities, radius=self.radius, scaling=settings.inputs,
             wall_distance=self.radius if settings.wall_distance is None else settings.wall_distance * spec.spacing,
-            relative_velocity=settings.relative_velocity, ballistic=settings.ballistic, walls=settings.walls,
+            absolute=settings.encoder == "absolute", relative_velocity=settings.relative_velocity, ballistic=settings.ballistic, walls=settings.walls,
         )
         self.network = Network(settings, self.features.node_width, self.features.edge_width, spec.dim)
 

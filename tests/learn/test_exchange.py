@@ -177,7 +177,7 @@ def test_files_that_are_not_there_or_not_theirs(tmp_path):
 
 @pytest.mark.parametrize(("settings", "changes", "key"), [
     ({"inputs": "last"}, {}, "inputs"), ({"relative_velocity": True}, {}, "relative_velocity"), ({"ballistic": True, "walls": True}, {}, "walls"),
-    ({"self_edges": False}, {}, "self_edges"),
+    ({"self_edges": False}, {}, "self_edges"), ({"encoder": "absolute"}, {}, "encoder"),
     ({"ballistic": True, "flight_below": 2}, {}, "flight_below"), ({"relaxation": {}}, {}, "relaxation"), ({}, {"stride": 2}, "stride"),
     ({}, {"context_mean": (0.0, 0.0), "context_std": (1.0, 1.0)}, "context"),
 ])

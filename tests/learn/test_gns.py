@@ -347,6 +347,7 @@ def test_lengths_in_spacings_and_noise_in_units():
     ("gns", {"inputs": "positions"}, "inputs"),
     ("gns", {"unroll": []}, "unroll"),
     ("gns", {"walls": True}, "ballistic"),
+    ("gns", {"encoder": "absolute", "relative_velocity": True}, "encoder: relative"),
     ("gns", {"unroll": [1, 0]}, "unroll.1"),
 ])
 def test_bad_settings_are_one_line(name, settings, message):

@@ -21,7 +21,8 @@ class TextbookNetwork(nn.Module):
 
     def forward(self, nodes, edges, graph):
         receiver, sender = graph.receiver.long(), graph.sender.long()
-        nodes, edges = mlp(self.network.encode_node, nodes), mlp(self.network.encode_edge, edges)
+        encode_edge, nodes = self.network.encode_edge, mlp(self.network.encode_node, nodes)
+        edges = encode_edge.repeat(graph.edges, 1) if isinstance(encode_edge, nn.Parameter) else mlp(encode_edge, edges)
         for _ in range(self.network.repeats):
             for block in self.network.processor:
                 message = mlp(block.edge, torch.cat([edges, nodes[receiver], nodes[sender]], 1))
