@@ -43,7 +43,8 @@ def validate(kind: type[Checked], content: object, where: object, key: str) -> C
         raise InputError(where, path, shown, message.removeprefix("Value error, ")) from None
 
 
-def _write(path: str | Path, content: dict) -> None:
+def write_content(path: str | Path, content: dict) -> None:
+    """Write what ``torch.load(weights_only=True)`` can read, atomically."""
     # By way of memory: on a full disk torch's own writer raises no OSError.
     buffer = io.BytesIO()
     torch.save(content, buffer)
@@ -51,19 +52,24 @@ def _write(path: str | Path, content: dict) -> None:
         temporary.write_bytes(buffer.getbuffer())
 
 
-def _read(path: str | Path, form: str, keys: dict[str, type], device: torch.device | str, remedy: str) -> dict:
-    """The content of a file of format ``form``, checked to have ``keys`` of these types and no other."""
+def read_content(path: str | Path, device: torch.device | str, form: str, remedy: str) -> object:
+    """The content of a file, read without running code from it; ``form`` and ``remedy`` are for the ``InputError`` of one that is damaged."""
     path = Path(path)
     if not path.is_file():
         raise InputError(path, "file", str(path), "no such file; correct the path")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            content = torch.load(path, map_location=device, weights_only=True)
+            return torch.load(path, map_location=device, weights_only=True)
     # What a damaged or hostile file raises is open-ended (zip, pickle, storage and type errors); all of it is a bad file.
     except Exception as error:
         reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
         raise InputError(path, "file", reason, f"damaged, or not a {form} file; {remedy}") from None
+
+
+def _read(path: str | Path, form: str, keys: dict[str, type], device: torch.device | str, remedy: str) -> dict:
+    """The content of a file of format ``form``, checked to have ``keys`` of these types and no other."""
+    content = read_content(path, device, form, remedy)
     if not isinstance(content, dict) or content.get("format") != form:
         raise InputError(path, "format", content.get("format") if isinstance(content, dict) else type(content).__name__, f"must be {form}; {remedy}")
     if content.get("format_version") != FORMAT_VERSION:
@@ -85,7 +91,7 @@ def save_model(path: str | Path, model: nn.Module, provenance: dict | None = Non
     names = [name for name, place in MODELS.items() if place == (type(model).__module__, type(model).__qualname__)]
     if not names:
         raise ValueError(f"{type(model).__name__} is not registered in learn/model.py")
-    _write(path, {
+    write_content(path, {
         "format": MODEL_FORMAT, "format_version": FORMAT_VERSION, "model": names[0], "settings": json.loads(json.dumps(model.settings)),
         "spec": model.spec.to_dict(), "provenance": json.loads(json.dumps(provenance or {})),
         "state_dict": {name: value.detach().cpu().contiguous() for name, value in model.state_dict().items()},
@@ -148,7 +154,7 @@ STATE_KEYS = {
 
 def save_state(path: str | Path, state: dict) -> None:
     """Write a training state: the keys of ``STATE_KEYS``."""
-    _write(path, {"format": STATE_FORMAT, "format_version": FORMAT_VERSION, **state})
+    write_content(path, {"format": STATE_FORMAT, "format_version": FORMAT_VERSION, **state})
 
 
 def load_state(path: str | Path, device: torch.device | str = "cpu") -> dict:

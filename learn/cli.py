@@ -1,4 +1,4 @@
-"""``sluice-learn``: train a model, roll one out, look into a checkpoint.
+"""``sluice-learn``: train a model, roll one out, look into a checkpoint, exchange one with the PyTorch port of GNS.
 
 Exit codes: 0 done; 1 failed while running (training diverged or was stopped; resume by the same command); 2 bad input, nothing written.
 torch is imported by the commands, not here, so that ``--help`` is quick.
@@ -59,6 +59,32 @@ def _info(arguments: argparse.Namespace) -> None:
     print(json.dumps(shown, indent=1, sort_keys=True))
 
 
+def _import_model(arguments: argparse.Namespace) -> None:
+    from pathlib import Path
+
+    from learn.checkpoint import file_hash, save_model
+    from learn.exchange import import_model
+
+    if Path(arguments.out).exists():
+        raise InputError(arguments.out, "--out", arguments.out, "exists; give another name, or delete it")
+    model = import_model(
+        arguments.model, arguments.metadata, edges=arguments.edges, noise_std=arguments.noise_std, spacing=arguments.spacing,
+        gravity=arguments.gravity, particle_types=arguments.types,
+    )
+    save_model(arguments.out, model, {"source": "geoelements/gns", "file": arguments.model, "sha256": file_hash(arguments.model)})
+    print(f"{arguments.out}: {model.options.message_passing} blocks of width {model.options.latent}, {model.velocities} velocities")
+
+
+def _export_model(arguments: argparse.Namespace) -> None:
+    from learn.checkpoint import load_model
+    from learn.exchange import export_model
+
+    metadata = export_model(load_model(arguments.checkpoint), arguments.out)
+    sizes = ", ".join(f"{name} {metadata[name]}" for name in ("latent_dim", "nmlp_layers", "nmessage_passing_steps", "input_sequence_length"))
+    version = "of 11 December 2024 or later" if metadata["edges"] == "updated" else "of before 11 December 2024"
+    print(f"{arguments.out}: for geoelements/gns {version} with --noise_std={metadata['noise_std']:.9g}; {sizes} (its train.py: 128, 2, 10, 6)")
+
+
 def _positive(text: str) -> int:
     value = int(text)
     if value < 1:
@@ -113,6 +139,25 @@ def parser() -> argparse.ArgumentParser:
     info = commands.add_parser("info", help="what a checkpoint holds, as JSON", description="What a checkpoint holds, as JSON.")
     info.add_argument("checkpoint", metavar="CHECKPOINT", help="a best.pt")
     info.set_defaults(act=_info)
+
+    text = "Turn a model of the PyTorch port geoelements/gns into a checkpoint of equal outputs. Options override the metadata."
+    taken = commands.add_parser("import-model", help="make a checkpoint of a model of geoelements/gns", description=text)
+    taken.add_argument("model", metavar="MODEL", help="a model-<step>.pt")
+    taken.add_argument("--metadata", required=True, metavar="FILE", help="the metadata.json of its data")
+    taken.add_argument("--edges", choices=("updated", "doubled"),
+                       help="what its version did to them after a block: updated since 11 December 2024, doubled before (v1.1.1, say)")
+    taken.add_argument("--noise_std", type=float, metavar="S", help="as given to its train.py, default: 6.7e-4")
+    taken.add_argument("--spacing", type=float, metavar="H", help="of the particles")
+    taken.add_argument("--gravity", type=float, nargs="+", metavar="G", help="one number an axis, length / s^2")
+    taken.add_argument("--types", type=int, nargs="+", metavar="ID", help="particle types that it was trained on")
+    taken.add_argument("--out", required=True, metavar="FILE", help="checkpoint to write")
+    taken.set_defaults(act=_import_model)
+
+    text = "Write a GNS checkpoint as model-0.pt and metadata.json of the PyTorch port geoelements/gns, of equal outputs."
+    given = commands.add_parser("export-model", help="write a checkpoint for geoelements/gns", description=text)
+    given.add_argument("checkpoint", metavar="CHECKPOINT", help="a best.pt")
+    given.add_argument("--out", required=True, metavar="DIR", help="new folder")
+    given.set_defaults(act=_export_model)
     return top
 
 

@@ -26,25 +26,41 @@ TYPE_SLOTS, TYPE_WIDTH = 9, 16
 SMALLEST_STD = 1e-8
 
 InputScaling = Literal["velocity", "acceleration", "last"]
+NoiseScheme = Literal["random_walk", "uncorrelated", "correlated", "last"]
 
 
 def random_walk_noise(
     position: Tensor, sigma: float | Tensor, generator: torch.Generator, moving: Tensor | None = None, place: tuple[int, int] | None = None
 ) -> Tensor:
-    """Noise for a window of positions whose velocities have done a random walk; [frames, particles, dim], zero in the first frame.
+    """``velocity_noise`` as the paper has it."""
+    return velocity_noise("random_walk", position, sigma, generator, moving, place)
 
-    Each of the C = frames - 1 velocities adds N(0, sigma^2 / C) per axis, summed along the window, so that the last velocity's noise
-    has standard deviation ``sigma`` [length / frame] (a number, or [dim]); summed once more into positions. Particles outside
-    ``moving`` [particles] get none.
+
+def velocity_noise(
+    scheme: NoiseScheme, position: Tensor, sigma: float | Tensor, generator: torch.Generator, moving: Tensor | None = None,
+    place: tuple[int, int] | None = None,
+) -> Tensor:
+    """Noise for a window of positions, summed up from noise of its C = frames - 1 velocities; [frames, particles, dim], zero in the first frame.
+
+    By the paper's four schemes, in each of which the last velocity's noise is N(0, sigma^2) per axis, sigma [length / frame] (a number, or
+    [dim]): "random_walk", every velocity adds N(0, sigma^2 / C) to the noise of the one before; "uncorrelated", every velocity has a draw of
+    its own; "correlated", all have the same; "last", the last velocity alone. Particles outside ``moving`` [particles] get none.
     Drawn on the CPU, so that a seed means the same noise on every device; and for the whole batch of which these particles are a process's share
     (``place``: ``Windows.place``), so that it means the same on any number of processes.
     """
     frames, particles, dim = position.shape
     first, whole = place or (0, particles)
-    steps = torch.randn((frames - 1, whole, dim), generator=generator, dtype=torch.float32)[:, first : first + particles]
-    steps = steps * (sigma / math.sqrt(frames - 1))
-    steps = steps.to(position)
-    noise = torch.cat([torch.zeros_like(position[:1]), steps.cumsum(0).cumsum(0)])
+    draws = frames - 1 if scheme in ("random_walk", "uncorrelated") else 1
+    velocity = torch.randn((draws, whole, dim), generator=generator, dtype=torch.float32)[:, first : first + particles]
+    velocity = velocity * (sigma / math.sqrt(frames - 1) if scheme == "random_walk" else sigma)
+    velocity = velocity.to(position)
+    if scheme == "random_walk":
+        velocity = velocity.cumsum(0)
+    elif scheme == "correlated":
+        velocity = velocity.expand(frames - 1, -1, -1)
+    elif scheme == "last":
+        velocity = torch.cat([torch.zeros_like(position[2:]), velocity])
+    noise = torch.cat([torch.zeros_like(position[:1]), velocity.cumsum(0)])
     return noise if moving is None else noise * moving[:, None]
 
 
@@ -55,15 +71,17 @@ class Features(nn.Module):
     sqrt(std^2 + sigma^2); velocities: C, how many past velocities are seen; radius: of the connectivity [length]; wall_distance: where
     the distances to the walls are clamped [length]; scaling: "velocity", C velocities by velocity std (the paper); "acceleration", the
     last velocity by velocity std and the C - 1 past accelerations by acceleration std; "last", the last velocity alone;
-    relative_velocity: v_sender - v_receiver on the edges; ballistic: predictions start from gravity * dt^2, not from the mean acceleration;
-    walls: that flight stops at the walls (slips along them), as the grid emulator's does, so that the stop need not be learnt.
+    absolute: places in the training data's box on the nodes and nothing on the edges (the paper's absolute encoder; the other one knows
+    relative places alone); relative_velocity: v_sender - v_receiver on the edges; ballistic: predictions start from gravity * dt^2, not from
+    the mean acceleration; walls: that flight stops at the walls (slips along them), as the grid emulator's does, so that the stop need not
+    be learnt.
     """
 
     def __init__(self, spec: DataSpec, *, sigma: float, velocities: int, radius: float, wall_distance: float, scaling: InputScaling,
-                 relative_velocity: bool, ballistic: bool, walls: bool = False):
+                 relative_velocity: bool, ballistic: bool, walls: bool = False, absolute: bool = False):
         super().__init__()
         self.velocities, self.radius, self.wall_distance = velocities, radius, wall_distance
-        self.scaling, self.relative_velocity, self.walls = scaling, relative_velocity, walls
+        self.scaling, self.relative_velocity, self.walls, self.absolute = scaling, relative_velocity, walls, absolute
         step = spec.frame_step * spec.stride
         base = [g * step * step for g in spec.gravity] if ballistic else spec.acceleration_mean
 
@@ -88,14 +106,16 @@ class Features(nn.Module):
             constant("context_std", [max(s, SMALLEST_STD) for s in spec.context_std])
         shown = 1 if scaling == "last" else velocities
         self.node_width = (shown + 2) * spec.dim + (TYPE_WIDTH if self.embedding else 0) + (len(spec.context_mean) if self.context else 0)
-        self.edge_width = spec.dim + 1 + (spec.dim if relative_velocity else 0)
+        self.node_width += spec.dim if absolute else 0
+        self.edge_width = 0 if absolute else spec.dim + 1 + (spec.dim if relative_velocity else 0)
 
     def moving(self, particle_type: Tensor) -> Tensor | None:
         """[particles] bool, or None where the data have no kinematic particle."""
         return particle_type != KINEMATIC_TYPE if self.kinematic else None
 
     def nodes(self, position: Tensor, particle_type: Tensor, bounds: Tensor, context: Tensor | None = None) -> Tensor:
-        """[particles, node_width]: motion (oldest first), clip(distance to lower and upper walls / wall_distance, -1, 1), type embedding, context.
+        """[particles, node_width]: motion (oldest first), clip(distance to lower and upper walls / wall_distance, -1, 1), type embedding, context,
+        and for the absolute encoder the place, -1 to 1 along every axis of the training data's box.
 
         position [C + 1, particles, dim], length; particle_type [particles] int64; bounds [dim, 2], length; context [particles, c].
         """
@@ -113,13 +133,18 @@ class Features(nn.Module):
             columns.append(self.embedding(particle_type))
         if self.context:
             columns.append((context - self.context_mean) / self.context_std)
+        if self.absolute:
+            columns.append(2 * (position[-1] - self.bounds[:, 0]) / (self.bounds[:, 1] - self.bounds[:, 0]) - 1)
         return torch.cat([column.to(self.velocity_std.dtype) for column in columns], 1)
 
     def edges(self, position: Tensor, graph: Graph) -> Tensor:
         """[edges, edge_width]: (x_sender - x_receiver) / radius, its norm, and optionally (v_sender - v_receiver) / velocity std.
 
-        position [C + 1, particles, dim], length.
+        position [C + 1, particles, dim], length. The absolute encoder sees none.
         """
+        if self.absolute:
+            return self.velocity_std.new_empty(graph.edges, 0)
+
         def difference(values: Tensor) -> Tensor:
             return values.index_select(0, graph.sender) - values.index_select(0, graph.receiver)
 

@@ -24,7 +24,7 @@ from pydantic import BaseModel, ConfigDict, Field, PositiveInt, model_validator
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from learn.features import Features, InputScaling, random_walk_noise
+from learn.features import Features, InputScaling, NoiseScheme, velocity_noise
 from learn.graph import Graph, radius_graph
 from learn.relaxation import Relaxation, relax
 from sim.simulator import SimulationError, Start
@@ -46,13 +46,17 @@ class Settings(BaseModel):
     hidden_layers: int = Field(2, ge=1)  # hidden layers of every MLP
     message_passing: int = Field(10, ge=1)  # M, blocks of the processor
     shared: bool = False  # one block, used M times
-    history: int = Field(5, ge=1)  # C, velocities the model is given; the noise walks along all of them
+    edge_update: bool = True  # blocks update the edges as well, e += m; without it they see the encoded edges alone, as in a port's older models
+    history: int = Field(5, ge=1)  # C, velocities the model is given; the noise is on all of them
     inputs: InputScaling = "velocity"  # what is made of them, see learn.features.Features; "acceleration" serves sparse impacts
+    encoder: Literal["relative", "absolute"] = "relative"  # absolute: places in the box on the nodes, a learnt constant on the edges
     relative_velocity: bool = False  # relative velocity among the edge features
+    self_edges: bool = True  # every particle also sends to itself
     radius: float | None = Field(None, gt=0)  # connectivity radius in particle spacings; None: the data's
     wall_distance: float | None = Field(None, gt=0)  # clamp of the wall distances in particle spacings; None: the connectivity radius
     noise: float = Field(0.3, ge=0)  # sigma of the last velocity's noise (the paper's 6.7e-4 is .25-.5 of its velocity std)
     noise_unit: Literal["velocity_std", "absolute"] = "velocity_std"  # of ``noise``: rms velocity std over the axes, or length / model frame
+    noise_scheme: NoiseScheme = "random_walk"  # see learn.features.velocity_noise
     ballistic: bool = False  # predictions start from gravity * dt^2 instead of the mean acceleration
     walls: bool = False  # with ``ballistic``: that flight stops at the walls; nothing stops a wrong prediction, so escapes stay visible
     unroll: tuple[PositiveInt, ...] = Field((1,), min_length=1)  # calls the loss is unrolled over, in equal shares of the training: (1, 2, 4)
@@ -67,11 +71,13 @@ class Settings(BaseModel):
     edge_cap: float = Field(4.0, gt=1)  # a rollout fails when its edges exceed this multiple of their first number (it clumps)
 
     @model_validator(mode="after")
-    def _walls_stop_flight(self) -> Settings:
+    def _go_together(self) -> Settings:
         if self.walls and not self.ballistic:
             raise ValueError("walls stops the ballistic flight; set ballistic: true with it")
         if self.flight_below and not self.ballistic:
             raise ValueError("flight_below means ballistic flight; set ballistic: true with it")
+        if self.relative_velocity and self.encoder == "absolute":
+            raise ValueError("relative_velocity is a feature of the edges, which the absolute encoder does not see; set encoder: relative")
         return self
 
 
@@ -116,8 +122,9 @@ def _bag_sum(values: Tensor, order: Tensor, offsets: Tensor) -> Tensor:
     return torch.embedding_bag(values, order, offsets, mode=0, include_last_offset=True)[0]
 
 
-def _edge_pass(graph: Graph, dtype: torch.dtype, table: Tensor, edges: Tensor, first: Tensor, rest: tuple[Tensor, ...], keep: bool):
-    """Messages m = MLP[e, v_r, v_s], their sums over each receiver's edges, and e + m, one run of edges after the other.
+def _edge_pass(graph: Graph, dtype: torch.dtype, table: Tensor, edges: Tensor, first: Tensor, rest: tuple[Tensor, ...], update: bool,
+               keep: bool):
+    """Messages m = MLP[e, v_r, v_s], their sums over each receiver's edges, and e + m (None without ``update``), one run of edges after the other.
 
     table [particles, 2, latent]: the particles' share of the first layer, as receiver (bias included) and as sender; edges
     [edges, latent]; first [latent, latent]: the edges' share of the first weight; rest: as ``MLP.rest``. Returns sums [particles, latent]
@@ -130,7 +137,7 @@ def _edge_pass(graph: Graph, dtype: torch.dtype, table: Tensor, edges: Tensor, f
     count, latent = len(edges) if keep else max(len(run.order) for run in graph.runs), len(gamma)
     hidden = [edges.new_empty(count, latent) for _ in weights]
     z, mean, rstd = edges.new_empty(count, latent), gamma.new_empty(count, 1), gamma.new_empty(count, 1)
-    updated = torch.empty_like(edges) if keep else edges
+    updated = None if not update else torch.empty_like(edges) if keep else edges
     sums = gamma.new_empty(graph.particles, latent)
     twos = torch.arange(0, 2 * max(len(run.order) for run in graph.runs) + 1, 2, dtype=torch.int32, device=edges.device)
     for run in graph.runs:
@@ -144,20 +151,21 @@ def _edge_pass(graph: Graph, dtype: torch.dtype, table: Tensor, edges: Tensor, f
         x = x if x.device.type == "cpu" else x.to(gamma.dtype)  # the CPU's kernel takes bf16 with weights in f32, and is spared a copy
         message, mean[kept], rstd[kept] = torch.native_layer_norm(x, (latent,), gamma, beta, NORM_EPSILON)
         sums[run.receivers] = _bag_sum(message, run.order, run.offsets)
-        torch.add(edges[run.edges], message.to(dtype), out=updated[run.edges])
+        if update:
+            torch.add(edges[run.edges], message.to(dtype), out=updated[run.edges])
     return sums, updated, (*hidden, z, mean, rstd)
 
 
-def _edge_pass_in_place(graph: Graph, dtype: torch.dtype, table: Tensor, edges: Tensor, first: Tensor, *rest: Tensor) -> tuple[Tensor, Tensor]:
-    return _edge_pass(graph, dtype, table, edges, first, rest, keep=False)[:2]
+def _edge_pass_in_place(graph: Graph, dtype: torch.dtype, update: bool, table: Tensor, edges: Tensor, first: Tensor, *rest: Tensor):
+    return _edge_pass(graph, dtype, table, edges, first, rest, update, keep=False)[:2]
 
 
 class _EdgeUpdate(torch.autograd.Function):
     """``_edge_pass`` with its gradient, run by run as well."""
 
     @staticmethod
-    def forward(ctx, graph: Graph, dtype: torch.dtype, table: Tensor, edges: Tensor, first: Tensor, *rest: Tensor):
-        sums, updated, kept = _edge_pass(graph, dtype, table, edges, first, rest, keep=True)
+    def forward(ctx, graph: Graph, dtype: torch.dtype, update: bool, table: Tensor, edges: Tensor, first: Tensor, *rest: Tensor):
+        sums, updated, kept = _edge_pass(graph, dtype, table, edges, first, rest, update, keep=True)
         ctx.graph, ctx.dtype, ctx.layers = graph, dtype, len(rest) // 2 - 1
         ctx.set_materialize_grads(False)
         ctx.save_for_backward(edges, first, *rest, *kept)
@@ -197,17 +205,17 @@ class _EdgeUpdate(torch.autograd.Function):
             grad_table[run.receivers, 0] = _bag_sum(gradient, run.order, run.offsets)
         grad_table[:, 1] = _bag_sum(grad_input, graph.reverse, graph.offsets)
         layers = [gradient for pair in zip(grad_weights, grad_biases, strict=True) for gradient in pair]
-        return None, None, grad_table, grad_edges, grad_first, *layers, grad_gamma, grad_beta
+        return None, None, None, grad_table, grad_edges, grad_first, *layers, grad_gamma, grad_beta
 
 
 class Interaction(nn.Module):
-    """One block of message passing: m = MLP_e[e, v_r, v_s], v += MLP_v[sum of m over incoming edges, v], e += m."""
+    """One block of message passing: m = MLP_e[e, v_r, v_s], v += MLP_v[sum of m over incoming edges, v], e += m if ``edge_update``."""
 
-    def __init__(self, latent: int, hidden_layers: int):
+    def __init__(self, latent: int, hidden_layers: int, edge_update: bool):
         super().__init__()
         self.edge = MLP(3 * latent, latent, hidden_layers, latent)
         self.node = MLP(2 * latent, latent, hidden_layers, latent)
-        self.latent = latent
+        self.latent, self.edge_update = latent, edge_update
 
     def forward(self, nodes: Tensor, edges: Tensor, graph: Graph, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
         """nodes [particles, latent], edges [edges, latent] -> both, updated."""
@@ -216,10 +224,10 @@ class Interaction(nn.Module):
         weight = torch.cat([edge.weight[:, d : 2 * d], edge.weight[:, 2 * d :]])
         table = _linear(nodes, weight, F.pad(edge.bias, (0, d)), dtype).view(-1, 2, d)
         step = _EdgeUpdate.apply if torch.is_grad_enabled() else _edge_pass_in_place
-        sums, edges = step(graph, dtype, table, edges, edge.weight[:, :d], *self.edge.rest())
+        sums, updated = step(graph, dtype, self.edge_update, table, edges, edge.weight[:, :d], *self.edge.rest())
         own = _linear(nodes, node.weight[:, d:], node.bias, dtype)
         update = self.node.finish(own + _linear(sums, node.weight[:, :d], None, dtype), dtype)
-        return nodes + update, edges
+        return nodes + update, edges if updated is None else updated
 
 
 class Network(nn.Module):
@@ -229,9 +237,10 @@ class Network(nn.Module):
         super().__init__()
         latent, hidden = settings.latent, settings.hidden_layers
         self.encode_node = MLP(node_width, latent, hidden, latent)
-        self.encode_edge = MLP(edge_width, latent, hidden, latent)
+        absolute = settings.encoder == "absolute"
+        self.encode_edge = nn.Parameter(torch.zeros(latent)) if absolute else MLP(edge_width, latent, hidden, latent)
         self.repeats = settings.message_passing if settings.shared else 1
-        self.processor = nn.ModuleList(Interaction(latent, hidden) for _ in range(settings.message_passing // self.repeats))
+        self.processor = nn.ModuleList(Interaction(latent, hidden, settings.edge_update) for _ in range(settings.message_passing // self.repeats))
         self.decode = MLP(latent, latent, hidden, dim, norm=False)
         self.low_precision = settings.precision == "bf16"
 
@@ -239,7 +248,10 @@ class Network(nn.Module):
         """nodes [particles, node_width], edges [edges, edge_width] -> [particles, dim]."""
         dtype = torch.bfloat16 if self.low_precision else nodes.dtype
         nodes = self.encode_node(nodes, dtype)
-        edges = torch.cat([self.encode_edge(edges[run.edges], dtype).to(dtype) for run in graph.runs])
+        if isinstance(self.encode_edge, nn.Parameter):
+            edges = self.encode_edge.to(dtype).repeat(graph.edges, 1)
+        else:
+            edges = torch.cat([self.encode_edge(edges[run.edges], dtype).to(dtype) for run in graph.runs])
         for _ in range(self.repeats):
             for block in self.processor:
                 nodes, edges = block(nodes, edges, graph, dtype)
@@ -264,7 +276,7 @@ class GNS(nn.Module):
         self.features = Features(
             spec, sigma=self.sigma, velocities=self.velocities, radius=self.radius, scaling=settings.inputs,
             wall_distance=self.radius if settings.wall_distance is None else settings.wall_distance * spec.spacing,
-            relative_velocity=settings.relative_velocity, ballistic=settings.ballistic, walls=settings.walls,
+            absolute=settings.encoder == "absolute", relative_velocity=settings.relative_velocity, ballistic=settings.ballistic, walls=settings.walls,
         )
         self.network = Network(settings, self.features.node_width, self.features.edge_width, spec.dim)
 
@@ -279,20 +291,20 @@ class GNS(nn.Module):
     def loss(self, windows: Windows, generator: torch.Generator, progress: float) -> Tensor:
         """Squared error of the normalised acceleration, summed over axes, averaged over particles that move.
 
-        The window's input gets a random-walk noise; the target is the acceleration that brings the *noisy* last velocity to the true
+        The window's input gets noise (``noise_scheme``); the target is the acceleration that brings the *noisy* last velocity to the true
         next one (later positions are shifted by the last position's noise). Unrolled over several calls, call j is judged by its
         position: error / (acceleration std * j (j + 1) / 2), the number of times an acceleration error has entered it by then; the
         mean over the calls is returned, which for one call is the paper's loss.
         """
         given = self.velocities + 1
         moving = self.features.moving(windows.particle_type)
-        noise = random_walk_noise(windows.position[:given], self.sigma, generator, moving, windows.place)
+        noise = velocity_noise(self.options.noise_scheme, windows.position[:given], self.sigma, generator, moving, windows.place)
         position = windows.position[:given] + noise
         total = position.new_zeros(())
         calls = len(windows.position) - given
         for call in range(1, calls + 1):
             context = windows.context[given + call - 2][windows.example] if self.features.context else None
-            graph = radius_graph(position[-1], self.radius, windows.example)
+            graph = radius_graph(position[-1], self.radius, windows.example, self.options.self_edges)
             output = self._predict(position, graph, windows.particle_type, self.features.bounds, context)
             following = windows.position[given + call - 1] + noise[-1]
             error = (output - self.features.target(position, following)) / (call * (call + 1) / 2)
@@ -310,7 +322,8 @@ class GNS(nn.Module):
     def _predict(self, position: Tensor, graph: Graph, particle_type: Tensor, bounds: Tensor, context: Tensor | None) -> Tensor:
         output = self.network(self.features.nodes(position, particle_type, bounds, context), self.features.edges(position, graph), graph)
         if self.options.flight_below:
-            output = output * (graph.offsets.diff() > self.options.flight_below)[:, None]  # every particle has its self edge as well
+            neighbours = graph.offsets.diff() - int(self.options.self_edges)
+            output = output * (neighbours >= self.options.flight_below)[:, None]
         return output
 
     def begin(self, start: Start) -> None:
@@ -345,8 +358,8 @@ class GNS(nn.Module):
         if self.features.context:
             row = torch.as_tensor(start.context[min(self._present, len(start.context) - 1)], device=self._position.device)
             context = row.expand(count, -1)
-        graph = radius_graph(self._position[-1], self.radius)
-        self._first_edges = self._first_edges or graph.edges
+        graph = radius_graph(self._position[-1], self.radius, self_edges=self.options.self_edges)
+        self._first_edges = self._first_edges or max(graph.edges, count)  # without self edges there may be none at first
         if graph.edges > self.options.edge_cap * self._first_edges:
             raise SimulationError(f"particles clump: {graph.edges} edges, {self.options.edge_cap:g} x the {self._first_edges} of the start exceeded")
         output = self._predict(self._position, graph, self._type, self._bounds, context)

@@ -20,7 +20,7 @@ RUN = 2048
 
 @dataclass(frozen=True)
 class Graph:
-    """Directed edges sorted by (receiver, sender); symmetric (with every edge its reverse), self edges included.
+    """Directed edges sorted by (receiver, sender); symmetric (with every edge its reverse).
 
     sender, receiver [edges] int32: particle indices; offsets [particles + 1] int32: the edges that particle i receives are
     ``offsets[i]:offsets[i + 1]``.
@@ -78,11 +78,12 @@ class Run:
     pairs: Tensor
 
 
-def radius_graph(position: Tensor, radius: float, example: Tensor | None = None) -> Graph:
-    """All ordered pairs with |x_i - x_j| <= radius, self edges included, no cap on the neighbours (Sanchez-Gonzalez et al. 2020).
+def radius_graph(position: Tensor, radius: float, example: Tensor | None = None, self_edges: bool = True) -> Graph:
+    """All ordered pairs with |x_i - x_j| <= radius, no cap on the neighbours (Sanchez-Gonzalez et al. 2020).
 
     position [particles, dim], length; radius: length; example [particles], ascending: pairs join only within one example (None: there
-    is one). Distances are taken in float64 of the given positions. Raises ``ValueError`` on a position that is not finite.
+    is one); self_edges: every particle also sends to itself. Distances are taken in float64 of the given positions. Raises ``ValueError``
+    on a position that is not finite.
     """
     points = position.detach().cpu().numpy().astype(np.float64)
     count = len(points)
@@ -96,7 +97,7 @@ def radius_graph(position: Tensor, radius: float, example: Tensor | None = None)
     trees = ((a, cKDTree(points[a:b])) for a, b in zip(bounds[:-1], bounds[1:], strict=True))
     pairs = np.concatenate([tree.query_pairs(radius, output_type="ndarray") + a for a, tree in trees])
     low, high = pairs[:, 0], pairs[:, 1]
-    key = np.concatenate([low * count + high, high * count + low, np.arange(count) * (count + 1)])
+    key = np.concatenate([low * count + high, high * count + low, np.arange(count if self_edges else 0) * (count + 1)])
     key.sort()
     receiver = key // count
     offsets = np.zeros(count + 1, np.int32)

@@ -5,7 +5,7 @@ import math
 import torch
 
 from learn.dataset import DataSpec
-from learn.features import Features, random_walk_noise
+from learn.features import Features, random_walk_noise, velocity_noise
 from learn.graph import radius_graph
 
 
@@ -138,6 +138,27 @@ def test_random_walk_noise_statistics():
     torch.testing.assert_close(steps.std((1, 2)), torch.full((4,), sigma / math.sqrt(5)), rtol=0.02, atol=0)
     correlation = torch.corrcoef(steps.flatten(1))
     assert (correlation - torch.eye(4)).abs().max() < 0.03
+
+
+def test_moments_of_the_other_schemes():
+    """The last velocity as in the random walk; what the others have in common with it tells the schemes apart."""
+    position, sigma = torch.zeros(6, 20000, 2), torch.tensor([0.3, 0.1])
+    for scheme, std, correlation in (("uncorrelated", 1, 0), ("correlated", 1, 1), ("last", 0, 0)):
+        noise = velocity_noise(scheme, position, sigma, torch.Generator().manual_seed(0), torch.arange(20000) > 0)
+        assert not noise[0].any() and not noise[:, 0].any()
+        velocity = noise.diff(dim=0)[:, 1:]
+        torch.testing.assert_close(velocity[-1].std(0), sigma, rtol=0.03, atol=0)
+        assert velocity[-1].mean(0).abs().max() < 4 * 0.3 / math.sqrt(20000)
+        torch.testing.assert_close(velocity[:-1].std(1), std * sigma.expand(4, 2), rtol=0.03, atol=0)
+        together = (velocity[:-1] * velocity[-1]).mean(1) / sigma**2
+        torch.testing.assert_close(together, torch.full((4, 2), float(correlation)), rtol=0.03, atol=0.03)
+
+
+def test_every_scheme_is_the_random_walk_where_there_is_one_velocity():
+    position = torch.zeros(2, 50, 2)
+    walk = random_walk_noise(position, 0.3, torch.Generator().manual_seed(0))
+    for scheme in ("uncorrelated", "correlated", "last"):
+        assert torch.equal(velocity_noise(scheme, position, 0.3, torch.Generator().manual_seed(0)), walk)
 
 
 def test_noise_is_the_generators_and_spares_kinematic_particles():

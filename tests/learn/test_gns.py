@@ -81,7 +81,7 @@ def relative(found: torch.Tensor, wanted: torch.Tensor) -> float:
     return ((found.double() - wanted.double()).norm() / wanted.double().norm()).item()
 
 
-@pytest.mark.parametrize("settings", [{}, {"hidden_layers": 1}, {"hidden_layers": 3}, {"shared": True}])
+@pytest.mark.parametrize("settings", [{}, {"hidden_layers": 1}, {"hidden_layers": 3}, {"shared": True}, {"edge_update": False}])
 @pytest.mark.parametrize("run", [50, 10**6])
 def test_equals_the_textbook_form(settings, run, monkeypatch):
     monkeypatch.setattr(graph_module, "RUN", run)
@@ -347,6 +347,7 @@ def test_lengths_in_spacings_and_noise_in_units():
     ("gns", {"inputs": "positions"}, "inputs"),
     ("gns", {"unroll": []}, "unroll"),
     ("gns", {"walls": True}, "ballistic"),
+    ("gns", {"encoder": "absolute", "relative_velocity": True}, "encoder: relative"),
     ("gns", {"unroll": [1, 0]}, "unroll.1"),
 ])
 def test_bad_settings_are_one_line(name, settings, message):

@@ -23,6 +23,14 @@ def test_hand_computed_edges():
     assert (graph.edges, graph.particles) == (8, 4)
 
 
+def test_without_self_edges():
+    position = torch.tensor([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [5.0, 5.0]])
+    graph = radius_graph(position, 1.0, self_edges=False)
+    assert pairs(graph) == [(0, 1), (0, 2), (1, 0), (2, 0)]
+    assert graph.offsets.tolist() == [0, 2, 3, 4, 4] and graph.reverse.tolist() == [2, 3, 0, 1]
+    assert radius_graph(position, 0.5, self_edges=False).edges == 0
+
+
 def test_examples_do_not_join():
     position = torch.zeros(4, 2)
     assert pairs(radius_graph(position, 1.0, torch.tensor([0, 0, 1, 1]))) == [(0, 0), (0, 1), (1, 0), (1, 1), (2, 2), (2, 3), (3, 2), (3, 3)]

@@ -21,11 +21,12 @@ class TextbookNetwork(nn.Module):
 
     def forward(self, nodes, edges, graph):
         receiver, sender = graph.receiver.long(), graph.sender.long()
-        nodes, edges = mlp(self.network.encode_node, nodes), mlp(self.network.encode_edge, edges)
+        encode_edge, nodes = self.network.encode_edge, mlp(self.network.encode_node, nodes)
+        edges = encode_edge.repeat(graph.edges, 1) if isinstance(encode_edge, nn.Parameter) else mlp(encode_edge, edges)
         for _ in range(self.network.repeats):
             for block in self.network.processor:
                 message = mlp(block.edge, torch.cat([edges, nodes[receiver], nodes[sender]], 1))
                 total = torch.zeros_like(nodes).index_add(0, receiver, message)
                 nodes = nodes + mlp(block.node, torch.cat([total, nodes], 1))
-                edges = edges + message
+                edges = edges + message if block.edge_update else edges
         return mlp(self.network.decode, nodes)
