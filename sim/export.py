@@ -28,25 +28,20 @@ pass one by one; memory is a few times the largest.
 
 from __future__ import annotations
 
-import io
 import math
-import os
 import pickle
-import shutil
 import struct
 import zipfile
 from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import h5py
 import numpy as np
 
-from sim import __version__
+from sim import __version__, periodic
 from sim.errors import InputError, RunError
 from sim.generate import SPLITS, read_content
-from sim.trajectory import ShardReader, flush, write_json
+from sim.trajectory import ShardReader, atomic_folder, new_hdf5, vacant, write_json
 
 VIEWER_FORMATS = ("vtkhdf", "ply", "vtu")
 LEARNER_FORMATS = ("geoelements", "deepmind", "lagrangebench")
@@ -93,13 +88,7 @@ def export(
     """
     if format not in FORMATS:
         raise InputError("sluice-sim export", "format", format, f"give one of {', '.join(FORMATS)}")
-    out = Path(os.path.abspath(out))
-    try:
-        taken = out.exists() and (not out.is_dir() or any(out.iterdir()))
-    except OSError as error:
-        raise InputError(out, "out", str(out), f"cannot be looked into ({error.strerror}); give another folder") from None
-    if taken:
-        raise InputError(out, "out", str(out), "exists already; give a new folder")
+    out = vacant(out)
     viewer = format in VIEWER_FORMATS
     for key, value in {"index": index, "frames": frames}.items():
         if value is not None and not viewer:
@@ -112,7 +101,7 @@ def export(
     # Everything that can be wrong with the request is found before anything is written.
     metadata = None if viewer else _metadata(found, format, exported)
     try:
-        with _new_folder(out) as folder:
+        with atomic_folder(out) as folder:
             if viewer:
                 for name, reader, number in _trajectories(found, index):
                     _write_for_viewers(folder / name / f"{number:06d}", format, reader, number, chosen)
@@ -124,24 +113,6 @@ def export(
     except OSError as error:
         raise RunError(f"{out}: cannot be written: {error.strerror or ' '.join(str(error).split())}") from None
     return exported
-
-
-@contextmanager
-def _new_folder(path: Path) -> Iterator[Path]:
-    """Yield a temporary folder beside ``path``; on success flush its files and rename it, on any error remove it. Complete or absent."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        temporary.mkdir(parents=True)
-    except OSError as error:
-        raise InputError(path, "out", str(path), f"cannot be written ({error.strerror}); give another folder") from None
-    try:
-        yield temporary
-        for file in temporary.rglob("*"):
-            if file.is_file():
-                flush(file)
-        os.replace(temporary, path)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def _slice(text: str) -> slice:
@@ -266,14 +237,15 @@ def _material_number(context: Collection[str]) -> str | None:
 def _write_for_viewers(stem: Path, format: str, reader: ShardReader, number: int, chosen: slice) -> None:
     """One trajectory: ``stem`` with the suffix, or a folder ``stem`` of frames."""
     position, kinds = reader.positions(number), reader.particle_type(number).astype(np.int32)
+    period = reader.period(number)
     step = float(reader.meta(number)["frame_step"])
     frames = range(len(position))[chosen]
     if format == "vtkhdf":
         stem.parent.mkdir(exist_ok=True)
-        _write_vtkhdf(stem.with_name(f"{stem.name}.vtkhdf"), position, kinds, _context(reader, number), step, frames)
+        _write_vtkhdf(stem.with_name(f"{stem.name}.vtkhdf"), position, kinds, _context(reader, number), step, frames, period)
     else:
         stem.mkdir(parents=True)
-        _write_frames(stem, format, position, kinds, step, frames)
+        _write_frames(stem, format, position, kinds, step, frames, period)
 
 
 def _in_space(rows: np.ndarray) -> np.ndarray:
@@ -281,16 +253,18 @@ def _in_space(rows: np.ndarray) -> np.ndarray:
     return np.concatenate([rows, np.zeros((*rows.shape[:-1], 3 - rows.shape[-1]), rows.dtype)], axis=-1)
 
 
-def velocities(position: np.ndarray, frames: Sequence[int], frame_step: float) -> np.ndarray:
-    """[len(frames), particles, dim] float32 [length / s] of ``position`` [frames, particles, dim]: backward differences, forward at frame 0."""
+def velocities(position: np.ndarray, frames: Sequence[int], frame_step: float, period: np.ndarray | None = None) -> np.ndarray:
+    """[len(frames), particles, dim] float32 [length / s] of ``position`` [frames, particles, dim]: backward differences, forward at frame 0,
+    by nearest images in a periodic box."""
     if len(position) < 2:
         return np.zeros((len(frames), *position.shape[1:]), np.float32)
     later = np.maximum(frames, 1)
-    return ((position[later].astype(np.float64) - position[later - 1]) / frame_step).astype(np.float32)
+    return (periodic.shortest(position[later].astype(np.float64) - position[later - 1], period) / frame_step).astype(np.float32)
 
 
 def _write_vtkhdf(
-    path: Path, position: np.ndarray, kinds: np.ndarray, context: dict[str, np.ndarray], frame_step: float, frames: range
+    path: Path, position: np.ndarray, kinds: np.ndarray, context: dict[str, np.ndarray], frame_step: float, frames: range,
+    period: np.ndarray | None,
 ) -> None:
     """A transient PolyData of vertices: points and velocities of all steps one after another, all else once. The context is field data.
 
@@ -299,7 +273,7 @@ def _write_vtkhdf(
     """
     count, particles = len(frames), position.shape[1]
     moving, shared = np.arange(count) * particles, np.zeros(count, np.int64)
-    with _hdf5(path) as (file, disk):
+    with new_hdf5(path) as (file, disk):
         root = file.create_group("VTKHDF")
         root.attrs["Version"] = np.array([2, 0], np.int64)
         root.attrs["Type"] = np.bytes_("PolyData")  # VTK reads ASCII of fixed length only
@@ -328,17 +302,19 @@ def _write_vtkhdf(
             some = frames[first : first + block]
             rows = slice(first * particles, (first + len(some)) * particles)
             points[rows] = _in_space(position[some]).reshape(-1, 3)
-            speeds[rows] = _in_space(velocities(position, some, frame_step)).reshape(-1, 3)
+            speeds[rows] = _in_space(velocities(position, some, frame_step, period)).reshape(-1, 3)
             disk.check()
 
 
-def _write_frames(folder: Path, format: str, position: np.ndarray, kinds: np.ndarray, frame_step: float, frames: range) -> None:
+def _write_frames(
+    folder: Path, format: str, position: np.ndarray, kinds: np.ndarray, frame_step: float, frames: range, period: np.ndarray | None
+) -> None:
     """``frame-00000.ply`` (or .vtu) and so on, numbered as in the trajectory. meshio's PLY holds scalars only: velocity_x, _y, _z."""
     import meshio
 
     vertices = [] if format == "ply" else [("vertex", np.arange(len(kinds))[:, None])]
     for frame in frames:
-        speed = _in_space(velocities(position, [frame], frame_step)[0])
+        speed = _in_space(velocities(position, [frame], frame_step, period)[0])
         data = dict(zip(("velocity_x", "velocity_y", "velocity_z"), speed.T, strict=True)) if format == "ply" else {"velocity": speed}
         mesh = meshio.Mesh(_in_space(position[frame]), vertices, point_data={"particle_type": kinds} | data)
         mesh.write(folder / f"frame-{frame:05d}.{format}", file_format=format)
@@ -412,7 +388,7 @@ def _metadata(source: _Source, format: str, exported: Exported) -> dict:
             "dx": first["spacing"], "write_every": 1, "num_particles_max": most,
             "sequence_length_train": first["frames"], "num_trajs_train": counts.get("train", 0),
             "sequence_length_test": first["frames"], "num_trajs_test": counts.get("test", 0),
-            "periodic_boundary_conditions": [False] * 3,  # three in 2D as well: its neighbour search asks for so many
+            "periodic_boundary_conditions": first["periodic"],
         }
     return metadata
 
@@ -425,6 +401,7 @@ def _common(reader: ShardReader, number: int, format: str) -> dict:
     if strange or not kinds:
         raise InputError(reader.path, f"{number:06d}/particle_type", strange or None, f"not particle types that {format} knows; give another format")
     values = {"dim": dim, "bounds": meta["bounds"], "radius": float(meta["radius"]), "frame_step": float(meta["frame_step"]), "frames": frames}
+    axes = meta["scene"].get("periodic", []) if isinstance(meta["scene"], dict) else []
     if format == "deepmind":
         if 4 * frames * particles * dim > _MESSAGE_LIMIT:
             raise InputError(reader.path, f"{number:06d}/position", (frames, particles, dim), "its records are below 2 GiB; give another format")
@@ -436,6 +413,11 @@ def _common(reader: ShardReader, number: int, format: str) -> dict:
         if not isinstance(spacing, int | float) or not spacing > 0:
             raise InputError(reader.path, f"{number:06d}/scene.spacing", spacing, "must be the spacing of the particles; generate the shard again")
         values["spacing"] = spacing
+        # Three in 2D as well: its neighbour search asks for so many.
+        values["periodic"] = [axis in axes for axis in periodic.AXES]
+    elif axes:
+        remedy = f"{format} knows walls all around, and would read jumps through the box; give lagrangebench"
+        raise InputError(reader.path, f"{number:06d}/scene.periodic", axes, remedy)
     return values
 
 
@@ -482,9 +464,9 @@ def _write_tfrecord(path: Path, trajectories: _Split) -> None:
             lists = {name: b"".join(_field(1, _bytes_feature(frame.astype("<f4"))) for frame in frames) for name, frames in lists.items()}
             message = _field(1, _map(features)) + _field(2, _map(lists))
             length = struct.pack("<Q", len(message))
-            file.write(length + struct.pack("<I", _masked(crc32c(length))))
+            file.write(length + struct.pack("<I", masked(crc32c(length))))
             file.write(message)
-            file.write(struct.pack("<I", _masked(crc32c(message))))
+            file.write(struct.pack("<I", masked(crc32c(message))))
 
 
 def _varint(number: int) -> bytes:
@@ -511,7 +493,7 @@ def _map(entries: dict[str, bytes]) -> bytes:
     return b"".join(_field(1, _field(1, name.encode()) + _field(2, value)) for name, value in entries.items())
 
 
-def _masked(crc: int) -> int:
+def masked(crc: int) -> int:
     """TFRecord's masked CRC: turned right by 15 bits, plus a constant."""
     return ((crc >> 15 | crc << 17) + 0xA282EAD8) & 0xFFFFFFFF
 
@@ -565,7 +547,7 @@ def _write_lagrangebench(path: Path, trajectories: _Split) -> None:
 
     Uncompressed and contiguous, since windows are read. The format has no place for a context.
     """
-    with _hdf5(path) as (file, disk):
+    with new_hdf5(path) as (file, disk):
         for number, (position, kinds, _) in enumerate(trajectories):
             group = file.create_group(f"{number:05d}")
             group.create_dataset("position", data=position)
@@ -578,48 +560,3 @@ _LEARNERS: dict[str, tuple[str, Callable[[Path, _Split], None]]] = {
     "deepmind": (".tfrecord", _write_tfrecord),
     "lagrangebench": (".h5", _write_lagrangebench),
 }
-
-
-# --- HDF5 ------------------------------------------------------------------------------------------------------------
-
-
-class _Disk(io.FileIO):
-    """A file for HDF5 to write to. What goes wrong below HDF5 (a full disk, Ctrl-C) would end the process with a segmentation fault;
-    here it is kept for ``check``, and nothing more is written.
-    """
-
-    error: BaseException | None = None
-
-    def write(self, data: memoryview) -> int:
-        try:
-            rest = memoryview(data).cast("B")
-            while self.error is None and rest:
-                rest = rest[super().write(rest) :]
-        except BaseException as error:
-            self.error = error
-        return len(data)
-
-    def truncate(self, size: int | None = None) -> int:
-        try:
-            return super().truncate(size)
-        except BaseException as error:
-            self.error = self.error or error
-            return size
-
-    def check(self) -> None:
-        """Raise what went wrong."""
-        if self.error is not None:
-            raise self.error
-
-
-@contextmanager
-def _hdf5(path: Path) -> Iterator[tuple[h5py.File, _Disk]]:
-    """Yield a new HDF5 file and the disk below it, to be checked now and then; raises ``OSError`` where something could not be written."""
-    with _Disk(path, "w+") as disk:
-        try:
-            with h5py.File(disk, "w", libver=("v108", "v110")) as file:
-                yield file, disk
-        except (OSError, RuntimeError):
-            disk.check()  # the cause, where there is one
-            raise
-        disk.check()

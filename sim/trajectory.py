@@ -11,9 +11,11 @@ what the seed determines: a resumed run must give the same bytes as an unbroken 
 
 from __future__ import annotations
 
+import io
 import json
 import os
-from collections.abc import Iterator
+import shutil
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,6 +23,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
+from sim import periodic
 from sim.errors import InputError
 
 FORMAT_VERSION = 1
@@ -37,7 +40,8 @@ class Trajectory:
 
     position [frames, particles, dim] float32; particle_type [particles] int8 (see ``PARTICLE_TYPES``); frame_step [s];
     radius: connectivity radius [length]; bounds [dim, 2]: inner faces of the container; context [frames, c] or None;
-    diagnostics: name -> [frames] float64; status: "ok" or "failed: why" (a failed trajectory keeps its finite frames).
+    seed: None where nobody knows it (imported data); diagnostics: name -> [frames] float64; status: "ok" or "failed: why" (a failed
+    trajectory keeps its finite frames).
     """
 
     position: np.ndarray
@@ -46,7 +50,7 @@ class Trajectory:
     radius: float
     bounds: np.ndarray
     scene: dict
-    seed: int
+    seed: int | None
     simulator: dict
     status: str = "ok"
     context: np.ndarray | None = None
@@ -60,6 +64,11 @@ class Trajectory:
     def moving(self) -> np.ndarray:
         """[particles] bool: not kinematic."""
         return self.particle_type != KINEMATIC_TYPE
+
+    @property
+    def period(self) -> np.ndarray | None:
+        """[dim]: see ``sim.periodic``."""
+        return periodic.period(self.scene, self.bounds)
 
 
 def flush(path: str | Path) -> None:
@@ -85,6 +94,78 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
+def vacant(path: str | Path) -> Path:
+    """The absolute path of a folder that is new or empty; ``InputError`` for any other."""
+    path = Path(os.path.abspath(path))
+    try:
+        taken = path.exists() and (not path.is_dir() or any(path.iterdir()))
+    except OSError as error:
+        raise InputError(path, "out", str(path), f"cannot be looked into ({error.strerror}); give another folder") from None
+    if taken:
+        raise InputError(path, "out", str(path), "exists already; give a new folder")
+    return path
+
+
+@contextmanager
+def atomic_folder(path: Path) -> Iterator[Path]:
+    """Yield a temporary folder beside ``path``; on success flush its files and rename it, on any error remove it. Complete or absent."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        temporary.mkdir(parents=True)
+    except OSError as error:
+        raise InputError(path, "out", str(path), f"cannot be written ({error.strerror}); give another folder") from None
+    try:
+        yield temporary
+        for file in temporary.rglob("*"):
+            if file.is_file():
+                flush(file)
+        os.replace(temporary, path)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+class Disk(io.FileIO):
+    """A file for HDF5 to write to. What goes wrong below HDF5 (a full disk, Ctrl-C) would end the process with a segmentation fault;
+    here it is kept for ``check``, and nothing more is written.
+    """
+
+    error: BaseException | None = None
+
+    def write(self, data: memoryview) -> int:
+        try:
+            rest = memoryview(data).cast("B")
+            while self.error is None and rest:
+                rest = rest[super().write(rest) :]
+        except BaseException as error:
+            self.error = error
+        return len(data)
+
+    def truncate(self, size: int | None = None) -> int:
+        try:
+            return super().truncate(size)
+        except BaseException as error:
+            self.error = self.error or error
+            return size
+
+    def check(self) -> None:
+        """Raise what went wrong."""
+        if self.error is not None:
+            raise self.error
+
+
+@contextmanager
+def new_hdf5(path: Path) -> Iterator[tuple[h5py.File, Disk]]:
+    """Yield a new HDF5 file and the disk below it, to be checked now and then; raises ``OSError`` where something could not be written."""
+    with Disk(path, "w+") as disk:
+        try:
+            with h5py.File(disk, "w", libver=("v108", "v110")) as file:
+                yield file, disk
+        except (OSError, RuntimeError):
+            disk.check()  # the cause, where there is one
+            raise
+        disk.check()
+
+
 def write_text(path: str | Path, text: str) -> None:
     """Write a text file atomically."""
     with atomic_path(path) as temporary:
@@ -96,37 +177,35 @@ def write_json(path: str | Path, content: object) -> None:
     write_text(path, json.dumps(content, indent=1, sort_keys=True, allow_nan=False) + "\n")
 
 
-def write_shard(path: str | Path, trajectories: dict[int, Trajectory]) -> None:
-    """Write a shard atomically: ``{index: trajectory}``. The bytes depend on the trajectories alone. Raises ``OSError``.
+def write_shard(path: str | Path, trajectories: dict[int, Trajectory] | Iterable[tuple[int, Trajectory]]) -> None:
+    """Write a shard atomically: ``{index: trajectory}``, or pairs by ascending index that are made as they are written, one in memory at a time.
 
-    The file is built in memory: on a full disk HDF5 raises a bare RuntimeError, and may do so again when the file is closed.
+    The bytes depend on the trajectories alone. Raises ``OSError``.
     """
-    with atomic_path(path) as temporary:
-        with h5py.File(temporary.name, "w", driver="core", backing_store=False, libver=("v108", "v110")) as file:
-            file.attrs["format_version"] = FORMAT_VERSION
-            file.attrs["particle_types"] = json.dumps(PARTICLE_TYPES, sort_keys=True)
-            for index in sorted(trajectories):
-                trajectory = trajectories[index]
-                group = file.create_group(f"{index:06d}")
-                group.create_dataset("position", data=np.ascontiguousarray(trajectory.position, np.float32))
-                group.create_dataset("particle_type", data=np.asarray(trajectory.particle_type, np.int8))
-                if trajectory.context is not None:
-                    group.create_dataset("context", data=np.asarray(trajectory.context, np.float32))
-                for name in sorted(trajectory.diagnostics):
-                    group.create_dataset(f"diagnostics/{name}", data=np.asarray(trajectory.diagnostics[name], np.float64))
-                meta = {
-                    "frame_step": float(trajectory.frame_step),
-                    "radius": float(trajectory.radius),
-                    "bounds": np.asarray(trajectory.bounds, float).tolist(),
-                    "scene": trajectory.scene,
-                    "seed": int(trajectory.seed),
-                    "simulator": trajectory.simulator,
-                    "status": trajectory.status,
-                }
-                group.attrs["meta"] = json.dumps(meta, sort_keys=True)
-            file.flush()
-            image = file.id.get_file_image()
-        temporary.write_bytes(image)
+    if isinstance(trajectories, dict):
+        trajectories = sorted(trajectories.items())
+    with atomic_path(path) as temporary, new_hdf5(temporary) as (file, disk):
+        file.attrs["format_version"] = FORMAT_VERSION
+        file.attrs["particle_types"] = json.dumps(PARTICLE_TYPES, sort_keys=True)
+        for index, trajectory in trajectories:
+            group = file.create_group(f"{index:06d}")
+            group.create_dataset("position", data=np.ascontiguousarray(trajectory.position, np.float32))
+            group.create_dataset("particle_type", data=np.asarray(trajectory.particle_type, np.int8))
+            if trajectory.context is not None:
+                group.create_dataset("context", data=np.asarray(trajectory.context, np.float32))
+            for name in sorted(trajectory.diagnostics):
+                group.create_dataset(f"diagnostics/{name}", data=np.asarray(trajectory.diagnostics[name], np.float64))
+            meta = {
+                "frame_step": float(trajectory.frame_step),
+                "radius": float(trajectory.radius),
+                "bounds": np.asarray(trajectory.bounds, float).tolist(),
+                "scene": trajectory.scene,
+                "seed": None if trajectory.seed is None else int(trajectory.seed),
+                "simulator": trajectory.simulator,
+                "status": trajectory.status,
+            }
+            group.attrs["meta"] = json.dumps(meta, sort_keys=True)
+            disk.check()
 
 
 def _check(condition: bool, path: Path, key: str, value: object, remedy: str) -> None:
@@ -215,8 +294,10 @@ class ShardReader:
                 meta = json.loads(group.attrs["meta"])
                 position, kinds = group["position"], group["particle_type"]
                 bounds = np.asarray(meta["bounds"], float)
-                numbers = [float(meta["frame_step"]), float(meta["radius"]), int(meta["seed"])]
-                meta["scene"], meta["simulator"], str(meta["status"])
+                numbers = [float(meta["frame_step"]), float(meta["radius"])]
+                meta["seed"] = None if meta["seed"] is None else int(meta["seed"])
+                meta["simulator"], str(meta["status"])
+                axes = meta["scene"].get("periodic", []) if isinstance(meta["scene"], dict) else []
             shape = getattr(position, "shape", None)
             remedy = "must be float32 [frames, particles, 2 or 3]"
             sound = isinstance(position, h5py.Dataset) and len(shape) == 3 and position.dtype == np.float32 and shape[2] in (2, 3)
@@ -225,6 +306,8 @@ class ShardReader:
             _check(sound, self.path, f"{index:06d}/particle_type", getattr(kinds, "shape", None), "must have one entry per particle")
             sound = bounds.shape == (shape[2], 2) and bool((bounds[:, 0] < bounds[:, 1]).all())
             _check(sound, self.path, f"{index:06d}/bounds", meta["bounds"], "must be [dim][lower, upper] with lower < upper")
+            sound = isinstance(axes, list) and all(axis in list(periodic.AXES[: shape[2]]) for axis in axes)
+            _check(sound, self.path, f"{index:06d}/scene.periodic", axes, f"must be a list of axes among {', '.join(periodic.AXES[: shape[2]])}")
             _check(numbers[0] > 0 and numbers[1] > 0, self.path, f"{index:06d}/frame_step, radius", numbers[:2], "must be positive")
             self._meta[index] = meta
         return self._meta[index]
@@ -233,6 +316,11 @@ class ShardReader:
         """(frames, particles, dim)."""
         self.meta(index)
         return self._group(index)["position"].shape
+
+    def period(self, index: int) -> np.ndarray | None:
+        """[dim]: see ``sim.periodic``."""
+        meta = self.meta(index)
+        return periodic.period(meta["scene"], meta["bounds"])
 
     def positions(self, index: int, start: int = 0, stop: int | None = None, step: int = 1) -> np.ndarray:
         """[frames, particles, dim] float32 of frames ``start:stop:step``."""
@@ -263,6 +351,6 @@ class ShardReader:
         meta = self.meta(index)
         return Trajectory(
             position=self.positions(index), particle_type=self.particle_type(index), frame_step=float(meta["frame_step"]),
-            radius=float(meta["radius"]), bounds=np.asarray(meta["bounds"], float), scene=meta["scene"], seed=int(meta["seed"]),
+            radius=float(meta["radius"]), bounds=np.asarray(meta["bounds"], float), scene=meta["scene"], seed=meta["seed"],
             simulator=meta["simulator"], status=meta["status"], context=self.context(index), diagnostics=self.diagnostics(index),
         )

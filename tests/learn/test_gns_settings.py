@@ -207,7 +207,7 @@ def test_the_company_in_a_batch_is_nothing(settings):
     if "unroll" not in settings:
         # Whatever the others are, to the last digit of a sum that is ordered by neighbours.
         context = windows.context[2][windows.example]
-        graph = radius_graph(windows.position[2], model.radius, windows.example, model.options.self_edges)
+        graph = radius_graph(windows.position[2], model.radius, windows.example, self_edges=model.options.self_edges)
         batch = model._predict(windows.position[:3], graph, windows.particle_type, model.features.bounds, context)
         first = outputs(model, windows.position[:3, :40], windows.particle_type[:40], context[:40])
         assert torch.allclose(batch[:40], first, rtol=0, atol=1e-12)

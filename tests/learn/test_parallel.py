@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from conftest import bounce
+from bouncing import bounce
 from parallel_child import gradient
 
 from learn.checkpoint import load_state
