@@ -53,7 +53,8 @@ def _rollout(arguments: argparse.Namespace) -> None:
 
     if (arguments.scene is None) == (arguments.data is None):
         raise InputError("command line", "--data", arguments.data, "give a SCENE file or --data DIR, one of the two")
-    common = {"frames": arguments.frames, "device": resolve_device(arguments.device, "command line"), "threads": arguments.threads}
+    common = {name: getattr(arguments, name) for name in ("batch", "frames", "threads")}
+    common["device"] = resolve_device(arguments.device, "command line")
     if arguments.scene is None:
         for option in ("seed", "variant"):
             if getattr(arguments, option) is not None:
@@ -166,6 +167,7 @@ def parser() -> argparse.ArgumentParser:
     rollout.add_argument("--variant", help="a named variant of the scene file")
     rollout.add_argument("--seed", type=_whole, help="of the scene's draws, default: 0")
     rollout.add_argument("--count", type=_positive, help="trajectories, default: all of the split, one of a scene")
+    rollout.add_argument("--batch", type=_positive, default=1, help="trajectories to roll out together (a GNS can), default: %(default)s")
     rollout.add_argument("--frames", type=_positive, help="predicted frames, default: to the end of the true trajectory or the scene")
     rollout.add_argument("--out", required=True, metavar="FILE", help="shard to write; run times go to FILE.cost.json")
     rollout.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="default: %(default)s")

@@ -16,6 +16,8 @@ Large graphs spend a few per cent of a training step on page faults; MALLOC_TRIM
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
@@ -259,6 +261,17 @@ class Network(nn.Module):
         return self.decode(nodes, dtype)
 
 
+@dataclass
+class _State:
+    """A rollout: positions [C + 1, particles, dim] float64, types, the frame it is at, edges of its first graph."""
+
+    start: Start
+    position: Tensor
+    kinds: Tensor
+    present: int
+    first_edges: int | None = None
+
+
 class GNS(nn.Module):
     """The learned simulator: features, network, semi-implicit Euler v' = v + a, p' = p + v' with dt = 1 (``learn.model.LearnedModel``)."""
 
@@ -331,6 +344,24 @@ class GNS(nn.Module):
 
     def begin(self, start: Start) -> None:
         """Take the last C + 1 model frames of the start. Raises ``ValueError`` on a start that is not of the model's kind."""
+        self.begin_many([start])
+
+    def begin_many(self, starts: Sequence[Start]) -> None:
+        """Begin from several starts in one box, to be advanced together by ``advance_many``."""
+        for start in starts:
+            self._check(start)
+            if not np.array_equal(start.bounds, starts[0].bounds):
+                raise ValueError(f"bounds {np.asarray(start.bounds).tolist()} beside {np.asarray(starts[0].bounds).tolist()}: one box a batch")
+        device = self.features.bounds.device
+        self._bounds = torch.as_tensor(starts[0].walls, device=device)
+        self._states = []
+        for start in starts:
+            # Positions in float64: differences of float32 positions lose the last digits of small accelerations, frame after frame.
+            frames = start.history[len(start.history) - self.history :: self.spec.stride].astype(np.float64)
+            kinds = torch.from_numpy(start.particle_type.astype(np.int64)).to(device)
+            self._states.append(_State(start, torch.from_numpy(frames).to(device), kinds, start.present))
+
+    def _check(self, start: Start) -> None:
         spec = self.spec
         if start.history.shape[2] != spec.dim:
             raise ValueError(f"the start has {start.history.shape[2]} dimensions, the model {spec.dim}")
@@ -344,41 +375,61 @@ class GNS(nn.Module):
         unknown = sorted(set(np.unique(start.particle_type).tolist()) - set(spec.particle_types))
         if unknown:
             raise ValueError(f"particle types {unknown} are not among the model's {list(spec.particle_types)}")
-        device = self.features.bounds.device
-        # Positions in float64: differences of float32 positions lose the last digits of small accelerations, frame after frame.
-        frames = start.history[len(start.history) - self.history :: spec.stride].astype(np.float64)
-        self._position = torch.from_numpy(frames).to(device)
-        self._type = torch.from_numpy(start.particle_type.astype(np.int64)).to(device)
-        self._bounds = torch.as_tensor(start.walls, device=device)
-        self._start, self._present, self._first_edges = start, start.present, None
+
+    def advance(self) -> np.ndarray:
+        """The next ``stride`` frames: one prediction, and frames between. Raises ``SimulationError`` when the particles clump."""
+        (found,) = self.advance_many([0])
+        if isinstance(found, SimulationError):
+            raise found
+        return found
 
     @torch.inference_mode()
-    def advance(self) -> np.ndarray:
-        """The next ``stride`` frames: one prediction, and frames between. Raises ``SimulationError`` when the particles clump.
+    def advance_many(self, which: Sequence[int]) -> list[np.ndarray | SimulationError]:
+        """``advance`` of these starts, as one graph: frames, or why there are none."""
+        states = [self._states[number] for number in which]
+        counts = [state.position.shape[1] for state in states]
+        position = torch.cat([state.position for state in states], 1)
+        kinds, example = torch.cat([state.kinds for state in states]), None
+        if len(states) > 1:
+            example = torch.repeat_interleave(torch.tensor(counts))
+        context = None
+        if self.features.context:
+            rows = [state.start.context[min(state.present, len(state.start.context) - 1)] for state in states]
+            context = torch.as_tensor(np.repeat(np.stack(rows), counts, axis=0), device=position.device)
+        period = states[0].start.period
+        graph = radius_graph(position[-1], self.radius, example, period, self.options.self_edges)
+        ends = np.cumsum([0, *counts])
+        edges = graph.offsets[torch.from_numpy(ends)].diff().tolist()
+        failed: dict[int, SimulationError] = {}
+        for number, state, own, count in zip(which, states, edges, counts, strict=True):
+            state.first_edges = state.first_edges or max(own, count)  # without self edges there may be none at first
+            if own > self.options.edge_cap * state.first_edges:
+                cap = f"{self.options.edge_cap:g} x the {state.first_edges} of the start"
+                failed[number] = SimulationError(f"particles clump: {own} edges, {cap} exceeded")
+        if failed:
+            # Without what has clumped: its edges may be too many to go through.
+            others = [number for number in which if number not in failed]
+            found = dict(zip(others, self.advance_many(others), strict=True)) if others else {}
+            return [failed[number] if number in failed else found[number] for number in which]
+        output = self._predict(position, graph, kinds, self._bounds, context, period)
+        acceleration = self.features.acceleration(output, position, self._bounds)
+        return [self._follow(state, acceleration[first:last]) for state, first, last in zip(states, ends[:-1], ends[1:], strict=True)]
+
+    def _follow(self, state: _State, acceleration: Tensor) -> np.ndarray:
+        """The frames up to the one that an acceleration leads to.
 
         Between, x(s) = x0 + s (x1 - x0) - s (1 - s) a / 2 with the predicted acceleration a kept between 0 and gravity: exact in free
         flight, straight through an impact, which a parabola would carry into the wall.
         """
-        start, stride, count = self._start, self.spec.stride, self._position.shape[1]
-        context = None
-        if self.features.context:
-            row = torch.as_tensor(start.context[min(self._present, len(start.context) - 1)], device=self._position.device)
-            context = row.expand(count, -1)
-        graph = radius_graph(self._position[-1], self.radius, period=start.period, self_edges=self.options.self_edges)
-        self._first_edges = self._first_edges or max(graph.edges, count)  # without self edges there may be none at first
-        if graph.edges > self.options.edge_cap * self._first_edges:
-            raise SimulationError(f"particles clump: {graph.edges} edges, {self.options.edge_cap:g} x the {self._first_edges} of the start exceeded")
-        output = self._predict(self._position, graph, self._type, self._bounds, context, start.period)
-        last = self._position[-1]
-        acceleration = self.features.acceleration(output, self._position, self._bounds)
-        following = 2 * last - self._position[-2] + acceleration
+        start, stride, last = state.start, self.spec.stride, state.position[-1]
+        following = 2 * last - state.position[-2] + acceleration
         known = None
         if start.kinematic is not None:
-            known = start.kinematic[np.minimum(self._present + 1 + np.arange(stride), len(start.kinematic) - 1)]
+            known = start.kinematic[np.minimum(state.present + 1 + np.arange(stride), len(start.kinematic) - 1)]
             known = torch.as_tensor(known, dtype=last.dtype, device=last.device)
-            following[self._type == KINEMATIC_TYPE] = known[-1]
+            following[state.kinds == KINEMATIC_TYPE] = known[-1]
         if self.options.relaxation is not None:
-            fixed = None if known is None else (self._type == KINEMATIC_TYPE).cpu().numpy()
+            fixed = None if known is None else (state.kinds == KINEMATIC_TYPE).cpu().numpy()
             relaxed = relax(following.cpu().numpy(), start.bounds, self.spec.spacing, self.options.relaxation, fixed, start.period)
             following = torch.from_numpy(relaxed).to(last.device)
         gravity = torch.as_tensor(start.gravity * (start.frame_step * stride) ** 2, dtype=last.dtype, device=last.device)
@@ -386,7 +437,7 @@ class GNS(nn.Module):
         share = torch.arange(1, stride + 1, dtype=last.dtype, device=last.device)[:, None, None] / stride
         frames = last + share * (following - last) - share * (1 - share) / 2 * fall
         if known is not None:
-            frames[:, self._type == KINEMATIC_TYPE] = known
-        self._position = torch.cat([self._position[1:], frames[-1:]])
-        self._present += stride
+            frames[:, state.kinds == KINEMATIC_TYPE] = known
+        state.position = torch.cat([state.position[1:], frames[-1:]])
+        state.present += stride
         return periodic.wrapped(frames.cpu().numpy(), start.bounds, start.period).astype(np.float32)

@@ -11,6 +11,7 @@ import sys
 import tempfile
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +24,7 @@ from sim import __version__, periodic
 from sim.errors import InputError, RunError
 from sim.generate import trajectory_seed
 from sim.scene import SceneFamily
-from sim.simulator import rollout, start_from
+from sim.simulator import Rollout, rollout, rollouts, start_from
 from sim.trajectory import Trajectory, write_json, write_shard
 
 
@@ -36,10 +37,20 @@ def rollout_trajectory(
     one), or as far as the context is known. A rollout that fails keeps its finite frames and its status. simulator: what the file says made it.
     """
     known = model.history if known is None else known
-    most = (len(trajectory.position) if trajectory.context is None else len(trajectory.context)) - known
-    wanted = len(trajectory.position) - known if frames is None else frames if trajectory.context is None else min(frames, most)
     with torch.no_grad():
-        result = rollout(model, start_from(trajectory, known), wanted)
+        result = rollout(model, start_from(trajectory, known), _wanted(trajectory, known, frames))
+    return _predicted(trajectory, known, result, simulator)
+
+
+def _wanted(trajectory: Trajectory, known: int, frames: int | None) -> int:
+    """Frames to predict."""
+    most = (len(trajectory.position) if trajectory.context is None else len(trajectory.context)) - known
+    if frames is None:
+        return len(trajectory.position) - known
+    return frames if trajectory.context is None else min(frames, most)
+
+
+def _predicted(trajectory: Trajectory, known: int, result: Rollout, simulator: dict) -> tuple[Trajectory, dict]:
     finite = int(np.isfinite(result.position).all(axis=(1, 2)).sum())
     position = np.concatenate([trajectory.position[:known], result.position[:finite]])
     predicted = Trajectory(
@@ -57,13 +68,14 @@ def _free(out: Path) -> None:
 
 def rollout_dataset(
     checkpoint: str | Path, data: str | Path, split: str, out: str | Path, count: int | None = None, frames: int | None = None,
-    device: torch.device | str = "cpu", threads: int = 1,
+    device: torch.device | str = "cpu", threads: int = 1, batch: int = 1,
 ) -> dict:
     """Roll a checkpoint out over the first ``count`` trajectories of a split (None: all) into the shard ``out``.
 
     Beside it, ``<out>.cost.json`` holds the run times; the returned dictionary is its content. Trajectories keep their indices; more frames
-    than the true ones have go on beyond their end. Raises ``InputError`` for faults of the input (nothing is written) and ``RunError``
-    if every rollout failed (after writing).
+    than the true ones have go on beyond their end. batch: trajectories that are rolled out together, where the model can (see
+    ``sim.simulator.rollouts``); sums run in another order then, and the last digits differ. Raises ``InputError`` for faults of the
+    input (nothing is written) and ``RunError`` if every rollout failed (after writing).
     """
     out = Path(out)
     _free(out)
@@ -72,12 +84,13 @@ def rollout_dataset(
         raise InputError(dataset.path, "--count", count, f"the {split} split has {len(dataset)} trajectories")
     check_fit(model, dataset, checkpoint)
     numbers = range(len(dataset) if count is None else count)
-    return _write(model, checkpoint, ((dataset.entries[number][0], dataset.trajectory(number)) for number in numbers), out, frames, device, threads)
+    starts = ((dataset.entries[number][0], dataset.trajectory(number)) for number in numbers)
+    return _write(model, checkpoint, starts, out, frames, device, threads, batch)
 
 
 def rollout_scene(
     checkpoint: str | Path, scene: str | Path, out: str | Path, variant: str | None = None, seed: int = 0, count: int = 1,
-    frames: int | None = None, device: torch.device | str = "cpu", threads: int = 1,
+    frames: int | None = None, device: torch.device | str = "cpu", threads: int = 1, batch: int = 1,
 ) -> dict:
     """Roll a checkpoint out from the first frames of ``count`` draws of a scene file, those of the test split of a data set with base seed ``seed``.
 
@@ -111,18 +124,23 @@ def rollout_scene(
             for number, (index, _) in enumerate(dataset.entries):
                 yield index, replace(dataset.trajectory(number), scene=drawn[index].to_dict(), context=drawn[index].context_values(), diagnostics={})
 
-        return _write(model, checkpoint, starts(), out, family.model.frames - model.history, device, threads)
+        return _write(model, checkpoint, starts(), out, family.model.frames - model.history, device, threads, batch)
 
 
 def _write(
     model: nn.Module, checkpoint: str | Path, starts: Iterable[tuple[int, Trajectory]], out: Path, frames: int | None,
-    device: torch.device | str, threads: int,
+    device: torch.device | str, threads: int, batch: int,
 ) -> dict:
     torch.set_num_threads(threads)
     simulator = {"name": model.name, "kind": model.kind, "settings": model.settings, "checkpoint": file_hash(checkpoint), "version": __version__}
     predicted, costs = {}, {}
-    for index, trajectory in starts:
-        predicted[index], costs[f"{index:06d}"] = rollout_trajectory(model, trajectory, frames, simulator)
+    starts, known = iter(starts), model.history
+    while some := list(islice(starts, batch)):
+        trajectories = [trajectory for _, trajectory in some]
+        with torch.no_grad():
+            results = rollouts(model, [start_from(one, known) for one in trajectories], [_wanted(one, known, frames) for one in trajectories])
+        for (index, trajectory), result in zip(some, results, strict=True):
+            predicted[index], costs[f"{index:06d}"] = _predicted(trajectory, known, result, simulator)
     write_shard(out, predicted)
     total = sum(cost["seconds"] for cost in costs.values())
     failed = {f"{index:06d}": trajectory.status for index, trajectory in predicted.items() if not trajectory.ok}

@@ -7,6 +7,7 @@ written once against this contract; a coarser solver, a GNS and "constant veloci
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
@@ -97,6 +98,40 @@ class SimulationError(RuntimeError):
     """A simulator cannot go on (time step at its floor, particle outside the grid); the message is the trajectory's status."""
 
 
+class _Run:
+    """A rollout on its way."""
+
+    def __init__(self, start: Start, frames: int):
+        self.start, self.frames, self.done, self.seconds, self.status, self.escaped = start, frames, 0, 0.0, "ok", None
+        self.position = np.full((frames, *start.history.shape[1:]), np.nan, np.float32)
+        self._moving, (self._lower, self._upper) = start.particle_type != KINEMATIC_TYPE, np.asarray(start.walls, float).T
+
+    @property
+    def going(self) -> bool:
+        return self.done < self.frames and self.status == "ok"
+
+    def take(self, block: np.ndarray | SimulationError) -> None:
+        """The next frames, or why there are none."""
+        start = self.start
+        if isinstance(block, SimulationError):
+            self.status = f"failed: {block} (frame {start.present + 1 + self.done})"
+            return
+        finite = np.isfinite(block).all(axis=(1, 2))
+        usable = len(block) if finite.all() else int(np.argmin(finite))
+        count = min(usable, self.frames - self.done)
+        self.position[self.done : self.done + count] = block[:count]
+        if self.escaped is None:
+            shown = block[:count, self._moving]
+            away = ((shown < self._lower - start.radius) | (shown > self._upper + start.radius)).any(axis=(1, 2))
+            self.escaped = start.present + 1 + self.done + int(np.argmax(away)) if away.any() else None
+        self.done += count
+        if usable < len(block) and self.done < self.frames:
+            self.status = f"failed: non-finite position (frame {start.present + 1 + self.done})"
+
+    def end(self, begin_seconds: float) -> Rollout:
+        return Rollout(position=self.position, seconds=self.seconds, begin_seconds=begin_seconds, status=self.status, escaped=self.escaped)
+
+
 def rollout(simulator: Simulator, start: Start, frames: int) -> Rollout:
     """Drive a simulator for ``frames`` frames after ``start.history[-1]``; a non-finite frame ends it with a status.
 
@@ -105,28 +140,32 @@ def rollout(simulator: Simulator, start: Start, frames: int) -> Rollout:
     clock = time.perf_counter
     begun = clock()
     simulator.begin(start)
-    begin_seconds = clock() - begun
-    position = np.full((frames, *start.history.shape[1:]), np.nan, np.float32)
-    done, status, seconds, escaped = 0, "ok", 0.0, None
-    moving, (lower, upper) = start.particle_type != KINEMATIC_TYPE, start.walls.T
-    while done < frames:
+    begin_seconds, run = clock() - begun, _Run(start, frames)
+    while run.going:
         begun = clock()
         try:
             block = simulator.advance()
         except SimulationError as error:
-            status = f"failed: {error} (frame {start.present + 1 + done})"
-            break
-        finally:
-            seconds += clock() - begun
-        finite = np.isfinite(block).all(axis=(1, 2))
-        usable = len(block) if finite.all() else int(np.argmin(finite))
-        count = min(usable, frames - done)
-        position[done : done + count] = block[:count]
-        if escaped is None:
-            away = ((block[:count, moving] < lower - start.radius) | (block[:count, moving] > upper + start.radius)).any(axis=(1, 2))
-            escaped = start.present + 1 + done + int(np.argmax(away)) if away.any() else None
-        done += count
-        if usable < len(block) and done < frames:
-            status = f"failed: non-finite position (frame {start.present + 1 + done})"
-            break
-    return Rollout(position=position, seconds=seconds, begin_seconds=begin_seconds, status=status, escaped=escaped)
+            block = error
+        run.seconds += clock() - begun
+        run.take(block)
+    return run.end(begin_seconds)
+
+
+def rollouts(simulator: Simulator, starts: Sequence[Start], frames: Sequence[int]) -> list[Rollout]:
+    """``rollout`` from several starts of one box: together where the simulator has ``begin_many`` and ``advance_many`` (``learn.gns``), each then
+    with its share of the seconds; else one after the other."""
+    if not hasattr(simulator, "begin_many"):
+        return [rollout(simulator, start, count) for start, count in zip(starts, frames, strict=True)]
+    clock = time.perf_counter
+    begun = clock()
+    simulator.begin_many(starts)
+    begin_seconds, runs = (clock() - begun) / len(starts), [_Run(start, count) for start, count in zip(starts, frames, strict=True)]
+    while going := [number for number, run in enumerate(runs) if run.going]:
+        begun = clock()
+        blocks = simulator.advance_many(going)
+        share = (clock() - begun) / len(going)
+        for number, block in zip(going, blocks, strict=True):
+            runs[number].seconds += share
+            runs[number].take(block)
+    return [run.end(begin_seconds) for run in runs]

@@ -18,7 +18,7 @@ from learn.graph import radius_graph
 from learn.model import build
 from learn.relaxation import Relaxation
 from sim.errors import InputError
-from sim.simulator import Start, rollout
+from sim.simulator import Start, rollout, rollouts
 
 torch.set_num_threads(1)
 
@@ -221,7 +221,43 @@ class Collapse(nn.Module):
 
     def forward(self, nodes, edges, graph):
         model, = self.of
-        return model.features.target(model._position, torch.full_like(model._position[-1], 0.5))
+        return model.features.target(model._states[0].position, torch.full_like(model._states[0].position[-1], 0.5))
+
+
+class CollapseFirst(nn.Module):
+    """Takes the first of two starts to one point, while it is there; the other goes on as it is."""
+
+    def __init__(self, model: GNS):
+        super().__init__()
+        self.of, self.calls = (model,), []
+
+    def forward(self, nodes, edges, graph):
+        model, = self.of
+        self.calls.append(graph.particles)
+        states = model._states if graph.particles == 49 else model._states[1:]
+        position = torch.cat([state.position for state in states], 1)
+        following = 2 * position[-1] - position[-2]
+        if len(states) == 2:
+            following[: states[0].position.shape[1]] = 0.5
+        return model.features.target(position, following)
+
+
+def test_rollouts_together_are_those_alone():
+    """Of different lengths and numbers of particles, one of which clumps on its way."""
+    model = small(spec(radius=0.2))
+    paths = [path(30, particles=n, seed=n) for n in (9, 16, 5)]
+    starts = [start(one, 6) for one in paths]
+    alone = [rollout(model, one, frames) for one, frames in zip(starts, (4, 7, 2), strict=True)]
+    together = rollouts(model, starts, (4, 7, 2))
+    for one, other in zip(alone, together, strict=True):
+        assert one.position.shape == other.position.shape and one.status == other.status == "ok"
+        assert np.allclose(one.position, other.position, rtol=0, atol=1e-6)
+    truth, model = path(30, particles=40), small(spec(radius=1e-3), edge_cap=2.0)
+    model.network = CollapseFirst(model)
+    first, second = rollouts(model, [start(truth, 6), start(paths[0], 6)], (3, 3))
+    assert first.status.startswith("failed: particles clump: 1600 edges") and first.status.endswith("(frame 7)")
+    assert np.isfinite(first.position[0]).all() and np.isnan(first.position[1:]).all()
+    assert second.status == "ok" and model.network.calls == [49, 9, 9]
 
 
 def test_clumping_ends_a_rollout():
