@@ -184,7 +184,7 @@ def parser() -> argparse.ArgumentParser:
     taken.add_argument("--metadata", required=True, metavar="FILE", help="the metadata.json of its data")
     taken.add_argument("--edges", choices=("updated", "doubled"),
                        help="what its version did to them after a block: updated since 11 December 2024, doubled before (v1.1.1, say)")
-    taken.add_argument("--noise_std", type=float, metavar="S", help="as given to its train.py, default: 6.7e-4")
+    taken.add_argument("--noise-std", type=float, metavar="S", help="as given to its train.py, default: 6.7e-4")
     taken.add_argument("--spacing", type=float, metavar="H", help="of the particles")
     taken.add_argument("--gravity", type=float, nargs="+", metavar="G", help="one number an axis, length / s^2")
     taken.add_argument("--types", type=int, nargs="+", metavar="ID", help="particle types that it was trained on")

@@ -5,6 +5,8 @@ from pathlib import Path
 
 import pytest
 import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 from port_gns import ROOT, Port, state_dict
 
 from learn.checkpoint import load_model, save_model
@@ -179,6 +181,7 @@ def test_files_that_are_not_there_or_not_theirs(tmp_path):
     ({"inputs": "last"}, {}, "inputs"), ({"relative_velocity": True}, {}, "relative_velocity"), ({"ballistic": True, "walls": True}, {}, "walls"),
     ({"self_edges": False}, {}, "self_edges"), ({"encoder": "absolute"}, {}, "encoder"),
     ({"ballistic": True, "flight_below": 2}, {}, "flight_below"), ({"relaxation": {}}, {}, "relaxation"), ({}, {"stride": 2}, "stride"),
+    ({}, {"periodic": ("x",)}, "periodic"),
     ({}, {"context_mean": (0.0, 0.0), "context_std": (1.0, 1.0)}, "context"),
 ])
 def test_what_the_port_cannot_be_is_refused(tmp_path, settings, changes, key):
@@ -186,6 +189,25 @@ def test_what_the_port_cannot_be_is_refused(tmp_path, settings, changes, key):
     with pytest.raises(InputError, match=key):
         export_model(model, tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_damaged_files(tmp_path, data):
+    """Truncated or overwritten anywhere, a model of the port is read or is an error of one line."""
+    options = {"edges": "updated", "spacing": 0.1, "gravity": [0.0, 0.0], "particle_types": [5]}
+    model, content = write(tmp_path, state_dict(2, 4, 1), metadata(2))
+    path = data.draw(st.sampled_from([model, content]))
+    raw = bytearray(path.read_bytes())
+    if data.draw(st.booleans()):
+        raw = raw[: data.draw(st.integers(0, len(raw) - 1))]
+    for place in data.draw(st.lists(st.integers(0, len(raw) - 1), max_size=8)) if raw else []:
+        raw[place] = data.draw(st.integers(0, 255))
+    path.write_bytes(raw)
+    try:
+        import_model(model, content, **options)
+    except InputError as error:
+        assert "\n" not in str(error)
 
 
 def test_only_a_gns_goes_to_the_port(tmp_path, capsys):

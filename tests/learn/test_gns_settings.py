@@ -1,5 +1,6 @@
 """What each setting of a GNS adds and does, by hand on four particles: 0 - 1 - 2 in a row, 0 and 2 out of each other's reach, 3 alone."""
 
+import numpy as np
 import pytest
 import torch
 from textbook_gns import TextbookNetwork, mlp
@@ -8,6 +9,7 @@ from learn.dataset import DataSpec, Windows
 from learn.gns import GNS
 from learn.graph import radius_graph
 from learn.model import build
+from sim.simulator import Start, rollout
 
 torch.set_num_threads(1)
 
@@ -36,6 +38,13 @@ def window(model: GNS, seed: int = 0) -> torch.Tensor:
 def outputs(model: GNS, position: torch.Tensor, kinds: torch.Tensor = KINDS, context: torch.Tensor | None = None) -> torch.Tensor:
     graph = radius_graph(position[-1], model.radius, self_edges=model.options.self_edges)
     return model._predict(position, graph, kinds, model.features.bounds, context)
+
+
+def start(path: torch.Tensor) -> Start:
+    return Start(
+        history=path.numpy(), particle_type=np.full(4, 5, np.int8), present=len(path) - 1, frame_step=0.01, radius=0.11,
+        bounds=np.array([[0, 1], [0, 1]]), scene={"gravity": [0, -9.81]},
+    )
 
 
 # Node features, edge features, edges, parameters. The plain one: 4 velocity and 4 wall columns; an MLP from n columns to a width of 4 has
@@ -236,3 +245,32 @@ def test_types_and_context_are_felt(name, change):
     position, plain = window(model), {"kinds": KINDS, "context": torch.zeros(4, 1)}
     moved = (outputs(model, position, **(plain | change)) - outputs(model, position, **plain)).abs().sum(1) > 1e-6
     assert moved.tolist() == ([True, True, True, False] if name == "types" else [True] * 4)
+
+
+@pytest.mark.parametrize("self_edges", [True, False])
+def test_the_graph_of_training_and_rollouts(self_edges, monkeypatch):
+    """Four edges between the row's particles; with those to themselves, eight."""
+    model = four({"self_edges": self_edges, "noise": 0.0})
+    path, seen = window(model).float(), []
+    forward = model.network.forward
+    monkeypatch.setattr(model.network, "forward", lambda nodes, edges, graph: seen.append(graph.edges) or forward(nodes, edges, graph))
+    model.loss(Windows(torch.cat([path, path[-1:]]).double(), KINDS, torch.zeros(4, dtype=torch.int64)), torch.Generator(), 0.0)
+    rollout(model, start(path), 1)
+    assert seen == [8, 8] if self_edges else seen == [4, 4]
+
+
+@pytest.mark.parametrize("self_edges", [True, False])
+@pytest.mark.parametrize(("least", "flying"), [(1, [False, False, False, True]), (2, [True, False, True, True])])
+def test_an_edge_to_oneself_is_no_neighbour(self_edges, least, flying):
+    model = four({"self_edges": self_edges, "ballistic": True, "flight_below": least})
+    assert (outputs(model, window(model)) == 0).all(1).tolist() == flying
+
+
+def test_a_start_without_edges_may_grow_some():
+    """Four particles in flight meet at a point: none of the twelve edges at first, then two, then all, and that is no clump."""
+    model = four({"self_edges": False, "radius": 0.4, "history": 1, "ballistic": True})
+    torch.nn.init.zeros_(model.network.decode.linears[-1].weight)
+    path = torch.tensor([[[0.30, 0.5], [0.35, 0.5], [0.42, 0.5], [0.50, 0.5]]])
+    path = torch.cat([path, path + 0.1 * (torch.tensor([0.35, 0.5]) - path)])
+    run = rollout(model, start(path), 9)
+    assert run.status == "ok" and np.ptp(run.position[-1, :, 0]) < 1e-4
