@@ -43,7 +43,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from sim import __version__
+from sim import __version__, periodic
 from sim.errors import InputError, RunError
 from sim.generate import SPLITS, read_content
 from sim.trajectory import ShardReader, flush, write_json
@@ -266,14 +266,15 @@ def _material_number(context: Collection[str]) -> str | None:
 def _write_for_viewers(stem: Path, format: str, reader: ShardReader, number: int, chosen: slice) -> None:
     """One trajectory: ``stem`` with the suffix, or a folder ``stem`` of frames."""
     position, kinds = reader.positions(number), reader.particle_type(number).astype(np.int32)
+    period = reader.period(number)
     step = float(reader.meta(number)["frame_step"])
     frames = range(len(position))[chosen]
     if format == "vtkhdf":
         stem.parent.mkdir(exist_ok=True)
-        _write_vtkhdf(stem.with_name(f"{stem.name}.vtkhdf"), position, kinds, _context(reader, number), step, frames)
+        _write_vtkhdf(stem.with_name(f"{stem.name}.vtkhdf"), position, kinds, _context(reader, number), step, frames, period)
     else:
         stem.mkdir(parents=True)
-        _write_frames(stem, format, position, kinds, step, frames)
+        _write_frames(stem, format, position, kinds, step, frames, period)
 
 
 def _in_space(rows: np.ndarray) -> np.ndarray:
@@ -281,16 +282,18 @@ def _in_space(rows: np.ndarray) -> np.ndarray:
     return np.concatenate([rows, np.zeros((*rows.shape[:-1], 3 - rows.shape[-1]), rows.dtype)], axis=-1)
 
 
-def velocities(position: np.ndarray, frames: Sequence[int], frame_step: float) -> np.ndarray:
-    """[len(frames), particles, dim] float32 [length / s] of ``position`` [frames, particles, dim]: backward differences, forward at frame 0."""
+def velocities(position: np.ndarray, frames: Sequence[int], frame_step: float, period: np.ndarray | None = None) -> np.ndarray:
+    """[len(frames), particles, dim] float32 [length / s] of ``position`` [frames, particles, dim]: backward differences, forward at frame 0,
+    by nearest images in a periodic box."""
     if len(position) < 2:
         return np.zeros((len(frames), *position.shape[1:]), np.float32)
     later = np.maximum(frames, 1)
-    return ((position[later].astype(np.float64) - position[later - 1]) / frame_step).astype(np.float32)
+    return (periodic.shortest(position[later].astype(np.float64) - position[later - 1], period) / frame_step).astype(np.float32)
 
 
 def _write_vtkhdf(
-    path: Path, position: np.ndarray, kinds: np.ndarray, context: dict[str, np.ndarray], frame_step: float, frames: range
+    path: Path, position: np.ndarray, kinds: np.ndarray, context: dict[str, np.ndarray], frame_step: float, frames: range,
+    period: np.ndarray | None,
 ) -> None:
     """A transient PolyData of vertices: points and velocities of all steps one after another, all else once. The context is field data.
 
@@ -328,17 +331,19 @@ def _write_vtkhdf(
             some = frames[first : first + block]
             rows = slice(first * particles, (first + len(some)) * particles)
             points[rows] = _in_space(position[some]).reshape(-1, 3)
-            speeds[rows] = _in_space(velocities(position, some, frame_step)).reshape(-1, 3)
+            speeds[rows] = _in_space(velocities(position, some, frame_step, period)).reshape(-1, 3)
             disk.check()
 
 
-def _write_frames(folder: Path, format: str, position: np.ndarray, kinds: np.ndarray, frame_step: float, frames: range) -> None:
+def _write_frames(
+    folder: Path, format: str, position: np.ndarray, kinds: np.ndarray, frame_step: float, frames: range, period: np.ndarray | None
+) -> None:
     """``frame-00000.ply`` (or .vtu) and so on, numbered as in the trajectory. meshio's PLY holds scalars only: velocity_x, _y, _z."""
     import meshio
 
     vertices = [] if format == "ply" else [("vertex", np.arange(len(kinds))[:, None])]
     for frame in frames:
-        speed = _in_space(velocities(position, [frame], frame_step)[0])
+        speed = _in_space(velocities(position, [frame], frame_step, period)[0])
         data = dict(zip(("velocity_x", "velocity_y", "velocity_z"), speed.T, strict=True)) if format == "ply" else {"velocity": speed}
         mesh = meshio.Mesh(_in_space(position[frame]), vertices, point_data={"particle_type": kinds} | data)
         mesh.write(folder / f"frame-{frame:05d}.{format}", file_format=format)
@@ -412,7 +417,7 @@ def _metadata(source: _Source, format: str, exported: Exported) -> dict:
             "dx": first["spacing"], "write_every": 1, "num_particles_max": most,
             "sequence_length_train": first["frames"], "num_trajs_train": counts.get("train", 0),
             "sequence_length_test": first["frames"], "num_trajs_test": counts.get("test", 0),
-            "periodic_boundary_conditions": [False] * 3,  # three in 2D as well: its neighbour search asks for so many
+            "periodic_boundary_conditions": first["periodic"],
         }
     return metadata
 
@@ -425,6 +430,7 @@ def _common(reader: ShardReader, number: int, format: str) -> dict:
     if strange or not kinds:
         raise InputError(reader.path, f"{number:06d}/particle_type", strange or None, f"not particle types that {format} knows; give another format")
     values = {"dim": dim, "bounds": meta["bounds"], "radius": float(meta["radius"]), "frame_step": float(meta["frame_step"]), "frames": frames}
+    axes = meta["scene"].get("periodic", []) if isinstance(meta["scene"], dict) else []
     if format == "deepmind":
         if 4 * frames * particles * dim > _MESSAGE_LIMIT:
             raise InputError(reader.path, f"{number:06d}/position", (frames, particles, dim), "its records are below 2 GiB; give another format")
@@ -436,6 +442,11 @@ def _common(reader: ShardReader, number: int, format: str) -> dict:
         if not isinstance(spacing, int | float) or not spacing > 0:
             raise InputError(reader.path, f"{number:06d}/scene.spacing", spacing, "must be the spacing of the particles; generate the shard again")
         values["spacing"] = spacing
+        # Three in 2D as well: its neighbour search asks for so many.
+        values["periodic"] = [axis in axes for axis in periodic.AXES]
+    elif axes:
+        remedy = f"{format} knows walls all around, and would read jumps through the box; give lagrangebench"
+        raise InputError(reader.path, f"{number:06d}/scene.periodic", axes, remedy)
     return values
 
 

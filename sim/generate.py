@@ -29,10 +29,9 @@ from pathlib import Path
 from typing import Protocol
 
 import numpy as np
-from scipy.spatial import cKDTree
 from tqdm import tqdm
 
-from sim import __version__
+from sim import __version__, periodic
 from sim.errors import InputError, RunError
 from sim.scene import SPLITS, Scene, SceneFamily
 from sim.simulator import SimulationError
@@ -544,7 +543,7 @@ def _shard_statistics(path: Path, neighbour_stride: int) -> _ShardStatistics:
     with ShardReader(path) as reader:
         for index in reader.indices():
             trajectory = reader.read(index)
-            position = trajectory.position[:, trajectory.moving].astype(np.float64)
+            position = periodic.unwrapped(trajectory.position[:, trajectory.moving].astype(np.float64), trajectory.period)
             velocity = np.diff(position, axis=0)
             result.velocity.add(velocity)
             result.acceleration.add(np.diff(velocity, axis=0))
@@ -554,8 +553,8 @@ def _shard_statistics(path: Path, neighbour_stride: int) -> _ShardStatistics:
             result.frames.append(len(position))
             if index % neighbour_stride == 0:
                 for frame in np.linspace(0, len(position) - 1, _NEIGHBOUR_FRAMES).astype(int):
-                    tree = cKDTree(trajectory.position[frame])
-                    result.neighbours.append(tree.count_neighbors(tree, trajectory.radius) / len(trajectory.position[frame]))
+                    tree = periodic.tree(trajectory.position[frame], trajectory.period)
+                    result.neighbours.append(tree.count_neighbors(tree, trajectory.radius) / tree.n)
     return result
 
 

@@ -12,6 +12,7 @@ from typing import Literal, Protocol
 
 import numpy as np
 
+from sim import periodic
 from sim.trajectory import KINEMATIC_TYPE, Trajectory
 
 Kind = Literal["reference", "solver", "learned", "trivial", "oracle", "floor"]
@@ -21,7 +22,8 @@ Kind = Literal["reference", "solver", "learned", "trivial", "oracle", "floor"]
 class Start:
     """What a simulator may know before it predicts.
 
-    history [h, particles, dim] float32: the last h known frames, the present last; particle_type [particles] int8;
+    history [h, particles, dim] float32: the last h known frames, the present last, in a periodic box going on through its faces
+    (what a simulator returns lies within it); particle_type [particles] int8;
     present: frame index of ``history[-1]``; frame_step [s]; radius; bounds [dim, 2]; scene: the resolved scene (what a
     solver starts from; a learned model may read its gravity and bounds, never its future); context [frames, c] or None:
     prescribed for all frames; kinematic [frames, k, dim] or None: prescribed positions of the kinematic particles.
@@ -42,12 +44,22 @@ class Start:
         """[dim], length / s^2."""
         return np.asarray(self.scene["gravity"], float)
 
+    @property
+    def period(self) -> np.ndarray | None:
+        """[dim]: see ``sim.periodic``."""
+        return periodic.period(self.scene, self.bounds)
+
+    @property
+    def walls(self) -> np.ndarray:
+        """[dim, 2]: the bounds, infinitely far away along periodic axes."""
+        return periodic.walls(self.bounds, self.period)
+
 
 def start_from(trajectory: Trajectory, history: int = 6) -> Start:
     """The start that hands a simulator the first ``history`` frames of a trajectory."""
     kinematic = ~trajectory.moving
     return Start(
-        history=trajectory.position[:history], particle_type=trajectory.particle_type, present=history - 1,
+        history=periodic.unwrapped(trajectory.position[:history], trajectory.period), particle_type=trajectory.particle_type, present=history - 1,
         frame_step=trajectory.frame_step, radius=trajectory.radius, bounds=trajectory.bounds, scene=trajectory.scene,
         context=trajectory.context, kinematic=trajectory.position[:, kinematic] if kinematic.any() else None,
     )
@@ -94,7 +106,7 @@ def rollout(simulator: Simulator, start: Start, frames: int) -> Rollout:
     begin_seconds = clock() - begun
     position = np.full((frames, *start.history.shape[1:]), np.nan, np.float32)
     done, status, seconds, escaped = 0, "ok", 0.0, None
-    moving, (lower, upper) = start.particle_type != KINEMATIC_TYPE, np.asarray(start.bounds, float).T
+    moving, (lower, upper) = start.particle_type != KINEMATIC_TYPE, start.walls.T
     while done < frames:
         begun = clock()
         try:

@@ -21,6 +21,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
+from sim import periodic
 from sim.errors import InputError
 
 FORMAT_VERSION = 1
@@ -60,6 +61,11 @@ class Trajectory:
     def moving(self) -> np.ndarray:
         """[particles] bool: not kinematic."""
         return self.particle_type != KINEMATIC_TYPE
+
+    @property
+    def period(self) -> np.ndarray | None:
+        """[dim]: see ``sim.periodic``."""
+        return periodic.period(self.scene, self.bounds)
 
 
 def flush(path: str | Path) -> None:
@@ -216,7 +222,8 @@ class ShardReader:
                 position, kinds = group["position"], group["particle_type"]
                 bounds = np.asarray(meta["bounds"], float)
                 numbers = [float(meta["frame_step"]), float(meta["radius"]), int(meta["seed"])]
-                meta["scene"], meta["simulator"], str(meta["status"])
+                meta["simulator"], str(meta["status"])
+                axes = meta["scene"].get("periodic", []) if isinstance(meta["scene"], dict) else []
             shape = getattr(position, "shape", None)
             remedy = "must be float32 [frames, particles, 2 or 3]"
             sound = isinstance(position, h5py.Dataset) and len(shape) == 3 and position.dtype == np.float32 and shape[2] in (2, 3)
@@ -225,6 +232,8 @@ class ShardReader:
             _check(sound, self.path, f"{index:06d}/particle_type", getattr(kinds, "shape", None), "must have one entry per particle")
             sound = bounds.shape == (shape[2], 2) and bool((bounds[:, 0] < bounds[:, 1]).all())
             _check(sound, self.path, f"{index:06d}/bounds", meta["bounds"], "must be [dim][lower, upper] with lower < upper")
+            sound = isinstance(axes, list) and all(axis in list(periodic.AXES[: shape[2]]) for axis in axes)
+            _check(sound, self.path, f"{index:06d}/scene.periodic", axes, f"must be a list of axes among {', '.join(periodic.AXES[: shape[2]])}")
             _check(numbers[0] > 0 and numbers[1] > 0, self.path, f"{index:06d}/frame_step, radius", numbers[:2], "must be positive")
             self._meta[index] = meta
         return self._meta[index]
@@ -233,6 +242,11 @@ class ShardReader:
         """(frames, particles, dim)."""
         self.meta(index)
         return self._group(index)["position"].shape
+
+    def period(self, index: int) -> np.ndarray | None:
+        """[dim]: see ``sim.periodic``."""
+        meta = self.meta(index)
+        return periodic.period(meta["scene"], meta["bounds"])
 
     def positions(self, index: int, start: int = 0, stop: int | None = None, step: int = 1) -> np.ndarray:
         """[frames, particles, dim] float32 of frames ``start:stop:step``."""
