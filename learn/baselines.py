@@ -11,8 +11,8 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
+from sim import periodic
 from sim.simulator import Kind, SimulationError, Start
 from sim.trajectory import KINEMATIC_TYPE, Trajectory
 
@@ -21,7 +21,8 @@ class Baseline:
     """The common part: state from the history, prescribed particles, one float32 frame a call. A baseline is its ``step``.
 
     position, velocity, acceleration [particles, dim] float64, length, length/frame, length/frame^2: differences of the last 1, 2, 3 known
-    positions; velocity and acceleration exist only as far as ``history`` (the frames of a ``Start`` that are needed) reaches.
+    positions; velocity and acceleration exist only as far as ``history`` (the frames of a ``Start`` that are needed) reaches. In a periodic
+    box positions go on through the faces; the frames handed out are wrapped.
     """
 
     name: str
@@ -54,7 +55,7 @@ class Baseline:
         self.frame += 1
         if self.start.kinematic is not None:
             self.position[self.kinematic] = self.start.kinematic[self.frame]
-        return self.position[None].astype(np.float32)
+        return periodic.wrapped(self.position, self.start.bounds, self.start.period)[None].astype(np.float32)
 
 
 class Frozen(Baseline):
@@ -92,7 +93,7 @@ class Ballistic(Baseline):
     def step(self) -> None:
         velocity = self.velocity + self.fall
         free = self.position + velocity
-        self.position = np.clip(free, self.start.bounds[:, 0], self.start.bounds[:, 1])
+        self.position = np.clip(free, *self.start.walls.T)
         self.velocity = np.where(free == self.position, velocity, 0.0)
 
 
@@ -120,7 +121,7 @@ class RigidDrop(Baseline):
         super().begin(start)
         self.fall = start.gravity * start.frame_step**2
         moving = np.flatnonzero(~self.kinematic)
-        pairs = cKDTree(self.position[moving]).query_pairs(start.radius, output_type="ndarray")
+        pairs = periodic.tree(self.position[moving], start.period).query_pairs(start.radius, output_type="ndarray")
         graph = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(moving), len(moving)))
         count, label = connected_components(graph, directed=False)
         self.bodies = [moving[label == body] for body in range(count)]
@@ -129,8 +130,8 @@ class RigidDrop(Baseline):
         low = np.array([self.position[body].min(axis=0) for body in self.bodies])
         high = np.array([self.position[body].max(axis=0) for body in self.bodies])
         # How far each body may still move down and up every axis; one that already sits closer than half a spacing is not pushed away.
-        self.room_down = np.minimum(start.bounds[:, 0] + half - low, 0.0)
-        self.room_up = np.maximum(start.bounds[:, 1] - half - high, 0.0)
+        self.room_down = np.minimum(start.walls[:, 0] + half - low, 0.0)
+        self.room_up = np.maximum(start.walls[:, 1] - half - high, 0.0)
 
     def step(self) -> None:
         velocity = self.body_velocity + self.fall
@@ -164,7 +165,7 @@ class Oracle(Baseline):
         super().begin(start)
         first = start.present + 1 - len(start.history)
         for trajectory in self.trajectories:
-            known = trajectory.position[first : start.present + 1]
+            known = periodic.unwrapped(trajectory.position[first : start.present + 1], trajectory.period, -1)
             if np.array_equal(known, start.history):
                 self.truth = trajectory.position
                 return
@@ -174,7 +175,7 @@ class Oracle(Baseline):
         if self.frame + 1 >= len(self.truth):
             raise SimulationError("the truth ends here")
         before, now, after = self.truth[self.frame - 1 : self.frame + 2].astype(float)
-        self.velocity = self.velocity + (after - 2 * now + before)
+        self.velocity = self.velocity + periodic.shortest(after - 2 * now + before, self.start.period)
         self.position = self.position + self.velocity
 
 

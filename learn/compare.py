@@ -7,7 +7,6 @@ or failed; ``status``, ``failures`` and ``one_step_note`` say which.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import os
 import platform
@@ -22,6 +21,7 @@ from typing import Literal
 import numpy as np
 
 from learn import metrics
+from sim import periodic
 from sim.simulator import Rollout, SimulationError, Simulator, Start, rollout, start_from
 from sim.trajectory import Trajectory
 
@@ -47,11 +47,6 @@ class CompareSettings:
 # Rollouts into rows ---------------------------------------------------------------------------------------------------------
 
 
-def start_at(trajectory: Trajectory, present: int, history: int) -> Start:
-    """The start that knows the ``history`` frames up to and including frame ``present``."""
-    return dataclasses.replace(start_from(trajectory, history), history=trajectory.position[present - history + 1 : present + 1], present=present)
-
-
 def _drive(contender: Simulator, start: Start, frames: int) -> Rollout:
     """``rollout``; a solver that fails while it runs the known frames in ``begin`` is a failed rollout as well."""
     try:
@@ -70,11 +65,12 @@ def _single_steps(contender: Simulator, trajectory: Trajectory, settings: Compar
     predicted = []
     for present in times:
         try:
-            contender.begin(start_at(trajectory, int(present), history))
+            contender.begin(start_from(trajectory, history, int(present)))
             predicted.append(contender.advance()[0])
         except SimulationError:
             return dict.fromkeys(names, math.nan)
-    predicted, true, moving = np.stack(predicted), trajectory.position[times + 1], trajectory.moving
+    true, moving = trajectory.position[times + 1], trajectory.moving
+    predicted = periodic.beside(np.stack(predicted), true, trajectory.period)
     return dict(zip(names, (metrics.one_step_mse(predicted, true), metrics.one_step_mse(predicted[:, moving], true[:, moving])), strict=True))
 
 
@@ -91,13 +87,13 @@ def _measure(contender: Simulator, trajectory: Trajectory, settings: CompareSett
         "trajectory_seed": trajectory.seed, "model_seed": contender.settings.get("seed"), "status": run.status,
         "seconds_per_frame": run.seconds / done if done else math.nan,
     }
-    before, true = trajectory.position[present, moving], trajectory.position[history:, moving]
+    before, true, period = trajectory.position[present, moving], trajectory.position[history:, moving], trajectory.period
 
     def energy(position: np.ndarray) -> np.ndarray:
-        return metrics.kinetic_energy(metrics.velocities(position, before, trajectory.frame_step))
+        return metrics.kinetic_energy(metrics.velocities(position, before, trajectory.frame_step, period))
 
     curves = {
-        "mse": metrics.frame_mse(run.position[:, moving], true),
+        "mse": metrics.frame_mse(periodic.beside(run.position[:, moving], true, period), true),
         "kinetic_energy": energy(run.position[:, moving]), "kinetic_energy_true": energy(true),
     }
     return figures, curves

@@ -11,9 +11,9 @@ import math
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
-from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
+from sim import periodic
 from sim.trajectory import Trajectory
 
 HORIZONS = (1, 5, 20, 100)
@@ -76,9 +76,9 @@ def escaped_fraction(position: np.ndarray, bounds: np.ndarray) -> np.ndarray:
 # Energy and momentum --------------------------------------------------------------------------------------------------------
 
 
-def velocities(position: np.ndarray, before: np.ndarray, frame_step: float) -> np.ndarray:
+def velocities(position: np.ndarray, before: np.ndarray, frame_step: float, period: np.ndarray | None = None) -> np.ndarray:
     """(p_t - p_(t-1)) / frame_step, [frames, particles, dim], length / s; ``before`` [particles, dim] precedes the first frame."""
-    return np.diff(np.concatenate([before[None], position]).astype(float), axis=0) / frame_step
+    return periodic.shortest(np.diff(np.concatenate([before[None], position]).astype(float), axis=0), period) / frame_step
 
 
 def kinetic_energy(velocity: np.ndarray) -> np.ndarray:
@@ -111,9 +111,18 @@ def subsample(count: int, limit: int) -> np.ndarray:
     return np.sort(np.random.default_rng(SUBSAMPLE_SEED).choice(count, limit, replace=False))
 
 
-def earth_movers_distance(p: np.ndarray, q: np.ndarray, spacing: float) -> float:
+def _costs(p: np.ndarray, q: np.ndarray, metric: str, period: np.ndarray | None) -> np.ndarray:
+    """[n, m]: |p_i - q_j| (``euclidean``) or its square (``sqeuclidean``)."""
+    p, q = np.asarray(p, float), np.asarray(q, float)
+    if period is None:
+        return cdist(p, q, metric)
+    square = (periodic.shortest(p[:, None] - q, period) ** 2).sum(axis=2)
+    return square if metric == "sqeuclidean" else np.sqrt(square)
+
+
+def earth_movers_distance(p: np.ndarray, q: np.ndarray, spacing: float, period: np.ndarray | None = None) -> float:
     """Exact Wasserstein-1 distance of two equally large clouds, min over matchings of mean |p_i - q_s(i)|, in particle spacings."""
-    cost = cdist(np.asarray(p, float), np.asarray(q, float))
+    cost = _costs(p, q, "euclidean", period)
     return float(cost[linear_sum_assignment(cost)].mean() / spacing)
 
 
@@ -128,13 +137,13 @@ def _soft_minimum(cost: np.ndarray, potential: np.ndarray, epsilon: float) -> np
 _TRANSPORT_TOLERANCE = 1e-6
 
 
-def entropic_transport(p: np.ndarray, q: np.ndarray, epsilon: float) -> float:
+def entropic_transport(p: np.ndarray, q: np.ndarray, epsilon: float, period: np.ndarray | None = None) -> float:
     """OT(p, q) = min over plans of <plan, |p_i - q_j|^2> + epsilon KL(plan | uniform product), length^2; NaN if it does not converge.
 
     Uniform weights. Log-domain Sinkhorn steps while epsilon is lowered from the squared diameter, then Newton steps on the dual (Brauer et
     al. 2017), without which clouds with a droplet several sqrt(epsilon) apart would take thousands of Sinkhorn steps.
     """
-    cost = cdist(np.asarray(p, float), np.asarray(q, float), "sqeuclidean")
+    cost = _costs(p, q, "sqeuclidean", period)
     rows, columns = cost.shape
     g = np.zeros(columns)
     scale = max(float(cost.max()), epsilon)
@@ -170,12 +179,12 @@ def entropic_transport(p: np.ndarray, q: np.ndarray, epsilon: float) -> float:
     return math.nan
 
 
-def _self_transport(p: np.ndarray, epsilon: float) -> float:
+def _self_transport(p: np.ndarray, epsilon: float, period: np.ndarray | None = None) -> float:
     """OT(p, p) with one potential; the averaged step converges in tens of iterations (Feydy et al. 2019).
 
     No log domain is needed: the kernel's diagonal is 1, so that the scalings stay between 1/n and sqrt(n).
     """
-    kernel = np.exp(-cdist(np.asarray(p, float), np.asarray(p, float), "sqeuclidean") / epsilon) / len(p)
+    kernel = np.exp(-_costs(p, p, "sqeuclidean", period) / epsilon) / len(p)
     u = np.ones(len(p))
     for _ in range(10_000):
         update = np.sqrt(u / (kernel @ u))
@@ -186,46 +195,54 @@ def _self_transport(p: np.ndarray, epsilon: float) -> float:
     return math.nan
 
 
-def sinkhorn_divergence(p: np.ndarray, q: np.ndarray, epsilon: float) -> float:
+def sinkhorn_divergence(p: np.ndarray, q: np.ndarray, epsilon: float, period: np.ndarray | None = None) -> float:
     """OT(p, q) - OT(p, p) / 2 - OT(q, q) / 2, length^2: >= 0, zero for equal clouds, |t|^2 for a cloud moved by t (Feydy et al. 2019).
 
     p [n, dim], q [m, dim]; uniform weights, squared distance; epsilon [length^2] is the entropic blur squared. Converged to 1e-6
     epsilon; NaN if that cannot be reached.
     """
-    return entropic_transport(p, q, epsilon) - 0.5 * (_self_transport(p, epsilon) + _self_transport(q, epsilon))
+    return entropic_transport(p, q, epsilon, period) - 0.5 * (_self_transport(p, epsilon, period) + _self_transport(q, epsilon, period))
 
 
-def density(position: np.ndarray, bounds: np.ndarray, cell: float, spacing: float) -> np.ndarray:
+def density(position: np.ndarray, bounds: np.ndarray, cell: float, spacing: float, period: np.ndarray | None = None) -> np.ndarray:
     """Volume fraction at the nodes of a grid over the container: bilinear deposit of spacing^dim a particle, over cell^dim.
 
-    [nodes, ...], 1 inside a cloud at rest and half of it on a wall; particles outside the container are left out.
+    [nodes, ...], 1 inside a cloud at rest and half of it on a wall; particles outside the container are left out. Along a periodic axis the
+    nodes run around, and cells are as much smaller as whole ones need to be.
     """
     position, bounds = np.asarray(position, float), np.asarray(bounds, float)
-    nodes = np.ceil((bounds[:, 1] - bounds[:, 0]) / cell - 1e-9).astype(int) + 1
+    around = np.zeros(len(bounds), bool) if period is None else period > 0
+    length = bounds[:, 1] - bounds[:, 0]
+    cells = np.ceil(length / cell - 1e-9).astype(int)
+    edge, nodes = np.where(around, length / cells, cell), np.where(around, cells, cells + 1)
+    position = periodic.wrapped(position, bounds, period)
     position = position[((position >= bounds[:, 0]) & (position <= bounds[:, 1])).all(axis=1)]
-    base = (position - bounds[:, 0]) / cell
-    corner = np.minimum(base.astype(int), nodes - 2)
+    base = (position - bounds[:, 0]) / edge
+    corner = np.minimum(base.astype(int), cells - 1)
     share = base - corner
     grid = np.zeros(nodes)
     for offset in np.ndindex(*(2,) * position.shape[1]):
         weight = np.where(offset, share, 1 - share).prod(axis=1)
-        np.add.at(grid, tuple((corner + offset).T), weight)
-    return grid * (spacing / cell) ** position.shape[1]
+        np.add.at(grid, tuple(((corner + offset) % nodes).T), weight)
+    return grid * np.prod(spacing / edge)
 
 
-def density_error(p: np.ndarray, q: np.ndarray, bounds: np.ndarray, spacing: float) -> tuple[float, float]:
+def density_error(
+    p: np.ndarray, q: np.ndarray, bounds: np.ndarray, spacing: float, period: np.ndarray | None = None
+) -> tuple[float, float]:
     """(mean, max) of |density(p) - density(q)| over the nodes where either is not zero; grid of two spacings, in rest densities."""
-    first, second = (density(cloud, bounds, 2 * spacing, spacing) for cloud in (p, q))
+    first, second = (density(cloud, bounds, 2 * spacing, spacing, period) for cloud in (p, q))
     used = (first > 0) | (second > 0)
     difference = np.abs(first - second)[used]
     return (float(difference.mean()), float(difference.max())) if used.any() else (0.0, 0.0)
 
 
-def spacing_ratio(p: np.ndarray, q: np.ndarray) -> float | None:
+def spacing_ratio(p: np.ndarray, q: np.ndarray, period: np.ndarray | None = None) -> float | None:
     """Mean nearest-neighbour distance in p over that in q (0.85-1.15 looks right, less is clumping); None below two particles."""
     if len(p) < 2 or len(q) < 2:
         return None
-    nearest = [cKDTree(np.asarray(cloud, float)).query(np.asarray(cloud, float), k=2)[0][:, 1].mean() for cloud in (p, q)]
+    trees = [periodic.tree(cloud, period) for cloud in (p, q)]
+    nearest = [tree.query(tree.data, k=2)[0][:, 1].mean() for tree in trees]
     return float(nearest[0] / nearest[1]) if nearest[1] > 0 else None
 
 
@@ -303,9 +320,11 @@ def cloud_metrics(p: np.ndarray, q: np.ndarray, trajectory: Trajectory, *, emd_p
     """Every cloud metric of one predicted frame p against the true one q, both [particles, dim], moving particles; NaN if p is not finite.
 
     ``sinkhorn`` has epsilon = R^2; clouds above the given sizes are subsampled for it and for ``emd``; ratios are predicted over true;
-    ``front_error``, ``centre_of_mass_error`` and ``emd`` in spacings, ``pile_angle_error`` in degrees.
+    ``front_error``, ``centre_of_mass_error`` and ``emd`` in spacings, ``pile_angle_error`` in degrees. In a periodic box p are the images beside
+    q, and extents, heights and slopes, which need walls to begin from, are None.
     """
     spacing, bounds, gravity = float(trajectory.scene["spacing"]), trajectory.bounds, np.asarray(trajectory.scene["gravity"], float)
+    period = trajectory.period
     if not np.isfinite(p).all():
         return dict.fromkeys(CLOUD_METRICS, math.nan)
 
@@ -313,21 +332,25 @@ def cloud_metrics(p: np.ndarray, q: np.ndarray, trajectory: Trajectory, *, emd_p
         return None if predicted is None or not true else predicted / true
 
     few, some = subsample(len(p), sinkhorn_particles), subsample(len(p), emd_particles)
-    mean, largest = density_error(p, q, bounds, spacing)
-    angles = [pile_angle(cloud, bounds, gravity, spacing) for cloud in (p, q)]
-    values = (
-        sinkhorn_divergence(p[few], q[few], trajectory.radius**2),
-        earth_movers_distance(p[some], q[some], spacing),
-        spacing_ratio(p, q),
+    mean, largest = density_error(p, q, bounds, spacing, period)
+    anywhere = (
+        sinkhorn_divergence(p[few], q[few], trajectory.radius**2, period),
+        earth_movers_distance(p[some], q[some], spacing, period),
+        spacing_ratio(p, q, period),
         mean,
         largest,
         centre_of_mass_error(p, q, spacing),
+    )
+    if period is not None:
+        return dict.fromkeys(CLOUD_METRICS) | dict(zip(CLOUD_METRICS, anywhere, strict=False))
+    angles = [pile_angle(cloud, bounds, gravity, spacing) for cloud in (p, q)]
+    between_walls = (
         abs(front(p, gravity) - front(q, gravity)) / spacing,
         ratio(width(p, gravity), width(q, gravity)),
         ratio(pile_height(p, bounds, gravity), pile_height(q, bounds, gravity)),
         None if None in angles else abs(angles[0] - angles[1]),
     )
-    return dict(zip(CLOUD_METRICS, values, strict=True))
+    return dict(zip(CLOUD_METRICS, anywhere + between_walls, strict=True))
 
 
 def evaluate(
@@ -338,15 +361,17 @@ def evaluate(
 
     Keys hold a number, or a dict by horizon ("1", ..., "all") or by share of the rollout ("0.25", ..., "1"); units as in the functions above,
     ``..._per_radius2`` and ``..._per_edge2`` (longest container edge) without unit. The clouds, energies and escapes are of the moving particles.
+    In a periodic box errors are those of the nearest images, and nothing escapes.
     """
-    moving = trajectory.moving
+    moving, period = trajectory.moving, trajectory.period
     true = trajectory.position[present + 1 : present + 1 + len(predicted)]
+    predicted = periodic.beside(predicted, true, period)
     p, q = predicted[:, moving], true[:, moving]
     edge = float((trajectory.bounds[:, 1] - trajectory.bounds[:, 0]).max())
     everything, only_moving = rollout_mse(predicted, true, horizons), rollout_mse(p, q, horizons)
     before = trajectory.position[present, moving]
-    velocity, true_velocity = velocities(p, before, trajectory.frame_step), velocities(q, before, trajectory.frame_step)
-    escaped = escaped_fraction(p, trajectory.bounds)
+    velocity, true_velocity = (velocities(cloud, before, trajectory.frame_step, period) for cloud in (p, q))
+    escaped = escaped_fraction(p, periodic.walls(trajectory.bounds, period))
     result = {
         "rollout_mse": everything,
         "rollout_mse_moving": only_moving,

@@ -38,7 +38,7 @@ from learn.dataset import Dataset, DataSettings, Sampler, Windows
 from learn.metrics import frame_mse, spacing_ratio
 from learn.parallel import Processes
 from learn.variants import with_variant
-from sim import __version__
+from sim import __version__, periodic
 from sim.errors import InputError, RunError
 from sim.simulator import rollout, start_from
 from sim.trajectory import KINEMATIC_TYPE, Trajectory, write_json, write_text
@@ -645,8 +645,9 @@ def rollout_score(model: nn.Module, trajectory: Trajectory, frames: int | None) 
     if result.status != "ok":
         return math.inf, math.nan, 0.0
     moving = trajectory.moving
-    predicted, truth = result.position[:, moving], truth[:, moving]
-    ratio = spacing_ratio(predicted[-1], truth[-1])
+    truth = truth[:, moving]
+    predicted = periodic.beside(result.position[:, moving], truth, trajectory.period)
+    ratio = spacing_ratio(predicted[-1], truth[-1], trajectory.period)
     return float(frame_mse(predicted, truth).mean()), math.nan if ratio is None else ratio, 1.0
 
 

@@ -45,14 +45,18 @@ def shortest(offset: np.ndarray, period: np.ndarray | None) -> np.ndarray:
     return offset if period is None else offset - turns(offset, period) * period
 
 
-def unwrapped(position: np.ndarray, period: np.ndarray | None) -> np.ndarray:
-    """[frames, particles, dim] without the jumps from face to face: no step of a frame is longer than half a period. Frame 0 stays as it is."""
+def beside(position: np.ndarray, other: np.ndarray, period: np.ndarray | None) -> np.ndarray:
+    """The images of positions that are nearest to ``other``, particle by particle."""
+    return position if period is None else position - turns(np.asarray(position, float) - other, period) * period
+
+
+def unwrapped(position: np.ndarray, period: np.ndarray | None, at: int = 0) -> np.ndarray:
+    """[frames, particles, dim] without the jumps from face to face: no step of a frame is longer than half a period. Frame ``at`` stays as it is."""
     if period is None:
         return position
-    steps = np.diff(position.astype(float), axis=0)
     moved = np.zeros(position.shape)
-    np.cumsum(turns(steps, period) * period, axis=0, out=moved[1:])
-    return (position - moved).astype(position.dtype)
+    np.cumsum(turns(np.diff(position.astype(float), axis=0), period), axis=0, out=moved[1:])
+    return (position - (moved - moved[at]) * period).astype(position.dtype)
 
 
 def wrapped(position: np.ndarray, bounds: np.ndarray, period: np.ndarray | None) -> np.ndarray:

@@ -22,8 +22,8 @@ Kind = Literal["reference", "solver", "learned", "trivial", "oracle", "floor"]
 class Start:
     """What a simulator may know before it predicts.
 
-    history [h, particles, dim] float32: the last h known frames, the present last, in a periodic box going on through its faces
-    (what a simulator returns lies within it); particle_type [particles] int8;
+    history [h, particles, dim] float32: the last h known frames, the present last, in a periodic box going on through its faces,
+    the present within it (as is what a simulator returns); particle_type [particles] int8;
     present: frame index of ``history[-1]``; frame_step [s]; radius; bounds [dim, 2]; scene: the resolved scene (what a
     solver starts from; a learned model may read its gravity and bounds, never its future); context [frames, c] or None:
     prescribed for all frames; kinematic [frames, k, dim] or None: prescribed positions of the kinematic particles.
@@ -55,13 +55,15 @@ class Start:
         return periodic.walls(self.bounds, self.period)
 
 
-def start_from(trajectory: Trajectory, history: int = 6) -> Start:
-    """The start that hands a simulator the first ``history`` frames of a trajectory."""
-    kinematic = ~trajectory.moving
+def start_from(trajectory: Trajectory, history: int = 6, present: int | None = None) -> Start:
+    """The start that hands a simulator ``history`` frames of a trajectory, the last of them ``present`` (None: the first ones)."""
+    kinematic, period = ~trajectory.moving, trajectory.period
+    present = history - 1 if present is None else present
     return Start(
-        history=periodic.unwrapped(trajectory.position[:history], trajectory.period), particle_type=trajectory.particle_type, present=history - 1,
+        history=periodic.unwrapped(trajectory.position[max(present + 1 - history, 0) : present + 1], period, -1),
+        particle_type=trajectory.particle_type, present=present,
         frame_step=trajectory.frame_step, radius=trajectory.radius, bounds=trajectory.bounds, scene=trajectory.scene,
-        context=trajectory.context, kinematic=trajectory.position[:, kinematic] if kinematic.any() else None,
+        context=trajectory.context, kinematic=periodic.unwrapped(trajectory.position[:, kinematic], period, present) if kinematic.any() else None,
     )
 
 

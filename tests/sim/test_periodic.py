@@ -62,9 +62,9 @@ def test_a_hair_below_the_lower_face_is_on_it():
     periodic.tree(np.array([[-1e-300, 0.0], [1.0, 0.0]]), np.array([1.0, 0.0]))  # refuses points on the upper face
 
 
-def test_a_start_goes_on_through_the_faces():
+def test_a_start_goes_on_through_the_faces_to_where_the_present_is():
     start = start_from(drift(), 4)
-    assert start.history[:, 0, 0].tolist() == [2.0, 3.5, 5.0, 6.5] and start.history.dtype == np.float32
+    assert start.history[:, 0, 0].tolist() == [-2.0, -0.5, 1.0, 2.5] and start.history.dtype == np.float32
     assert start.walls.tolist() == [[-np.inf, np.inf], [0.0, 2.0]]
 
 
