@@ -19,6 +19,8 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 from scipy.spatial import cKDTree
 
+from sim import periodic
+
 #: Support h of the kernel in particle spacings: 13 neighbours on a square lattice.
 SUPPORT = 2.0
 #: Farthest that one step moves a particle, in spacings.
@@ -35,15 +37,20 @@ class Relaxation(BaseModel):
     density: float = Field(2.0, ge=1)  # number density, 1 on the lattice, above which particles repel
 
 
-def relax(position: np.ndarray, bounds: np.ndarray, spacing: float, settings: Relaxation, fixed: np.ndarray | None = None) -> np.ndarray:
+def relax(
+    position: np.ndarray, bounds: np.ndarray, spacing: float, settings: Relaxation, fixed: np.ndarray | None = None,
+    period: np.ndarray | None = None,
+) -> np.ndarray:
     """Positions [particles, dim] float64 after ``settings.loops`` steps; bounds [dim, 2] and spacing in the same length.
 
-    fixed [particles] bool: kinematic particles, which repel and do not move.
+    fixed [particles] bool: kinematic particles, which repel and do not move; period [dim] of a periodic box, whose positions may be any images.
     """
+    outside = position - periodic.wrapped(position, bounds, period)
+    position = position - outside
     count, dim = position.shape
     reach = SUPPORT * spacing
     weight = (6 / (math.pi * SUPPORT**2)) if dim == 2 else 15 / (2 * math.pi * SUPPORT**3)
-    owner, sign, shift = _mirrors(position, bounds, reach)
+    owner, sign, shift = _images(position, bounds, reach, period)
     first, second = cKDTree(position[owner] * sign + shift).query_pairs(reach, output_type="ndarray").T
     # Both directions, towards particles only: an image moves with its owner.
     receiver, sender = np.concatenate([first, second]), np.concatenate([second, first])
@@ -64,18 +71,26 @@ def relax(position: np.ndarray, bounds: np.ndarray, spacing: float, settings: Re
             step[fixed] = 0
         length = np.sqrt((step**2).sum(1, keepdims=True))
         position = position + step * np.minimum(1, LONGEST * spacing / np.maximum(length, 1e-300))
-    return position
+    return position + outside
 
 
-def _mirrors(position: np.ndarray, bounds: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The particles, then their images in walls nearer than ``reach``, corners included: owner [k], sign and shift [k, dim] (x sign + shift)."""
+def _images(
+    position: np.ndarray, bounds: np.ndarray, reach: float, period: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The particles, then their images within ``reach`` of the box, corners included: owner [k], sign and shift [k, dim] (x sign + shift).
+
+    Images are mirrored in walls and a period away along periodic axes.
+    """
     owner = np.arange(len(position))
     sign, shift = np.ones_like(position), np.zeros_like(position)
     for axis in range(position.shape[1]):
         place = position[owner, axis]
-        for wall in bounds[axis]:
+        for wall, inward in zip(bounds[axis], (1, -1), strict=True):
             near = np.flatnonzero(np.abs(place - wall) < reach)
             image_sign, image_shift = sign[near].copy(), shift[near].copy()
-            image_sign[:, axis], image_shift[:, axis] = -1, 2 * wall
+            if period is not None and period[axis] > 0:
+                image_shift[:, axis] = inward * period[axis]
+            else:
+                image_sign[:, axis], image_shift[:, axis] = -1, 2 * wall
             owner, sign, shift = np.concatenate([owner, owner[near]]), np.concatenate([sign, image_sign]), np.concatenate([shift, image_shift])
     return owner, sign, shift
