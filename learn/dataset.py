@@ -19,6 +19,7 @@ import torch
 from pydantic import BaseModel, ConfigDict, Field
 
 from learn.parallel import Processes
+from sim import periodic
 from sim.errors import InputError
 from sim.trajectory import KINEMATIC_TYPE, ShardReader, Trajectory
 
@@ -51,7 +52,8 @@ class DataSpec:
     dim: 2 or 3; bounds (dim x (lower, upper)), radius, spacing: lengths; frame_step: seconds between *file* frames; stride: file frames
     a model frame spans; gravity [dim]: length / s^2; particle_types: sorted ids present. velocity_* [dim]: length / model frame;
     acceleration_* [dim]: length / model frame^2; both over the moving particles of the training split, std possibly 0 on an axis
-    without motion. context_*: [c], or None where the data have no context. Raises ``ValueError`` on impossible values.
+    without motion. context_*: [c], or None where the data have no context. periodic: axes ("x", ...) along which the box repeats itself.
+    Raises ``ValueError`` on impossible values.
     """
 
     dim: int
@@ -68,6 +70,7 @@ class DataSpec:
     acceleration_std: tuple[float, ...]
     context_mean: tuple[float, ...] | None = None
     context_std: tuple[float, ...] | None = None
+    periodic: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         for entry in fields(self):
@@ -104,16 +107,24 @@ class DataSpec:
             check(numbers(self.context_mean), "context_mean", "must be finite numbers")
             check(numbers(self.context_std, len(self.context_mean)), "context_std", "must match context_mean")
             check(min(self.context_std, default=0) >= 0, "context_std", "must not be negative")
+        axes = periodic.AXES[: self.dim]
+        sorted_ = isinstance(self.periodic, tuple) and self.periodic == tuple(axis for axis in axes if axis in self.periodic)
+        check(sorted_, "periodic", f"must be axes among {', '.join(axes)}, in this order")
+
+    @property
+    def period(self) -> np.ndarray | None:
+        """[dim]: see ``sim.periodic``."""
+        return periodic.period({"periodic": self.periodic}, self.bounds)
 
     def to_dict(self) -> dict:
-        """JSON-able; ``from_dict`` inverts it exactly."""
-        return asdict(self)
+        """JSON-able, without the periodic axes where there are none; ``from_dict`` inverts it exactly."""
+        return {name: value for name, value in asdict(self).items() if name != "periodic" or value}
 
     @classmethod
     def from_dict(cls, content: object, where: object = "data spec") -> DataSpec:
         """Inverse of ``to_dict``; ``where`` names the file in the ``InputError`` that anything malformed raises."""
         names = {entry.name for entry in fields(cls)}
-        if not isinstance(content, dict) or set(content) != names:
+        if not isinstance(content, dict) or set(content) | {"periodic"} != names:
             found = sorted(map(str, content)) if isinstance(content, dict) else content
             raise InputError(where, "spec", found, f"must have exactly the keys {', '.join(sorted(names))}")
         try:
@@ -235,7 +246,8 @@ class Dataset:
             try:
                 scene = meta["scene"]
                 values = {"dim": dim, "radius": float(meta["radius"]), "frame_step": float(meta["frame_step"]), "bounds": _tuple(meta["bounds"]),
-                          "spacing": float(scene["spacing"]), "gravity": tuple(float(g) for g in scene["gravity"])}
+                          "spacing": float(scene["spacing"]), "gravity": tuple(float(g) for g in scene["gravity"]),
+                          "periodic": periodic.axes(scene)}
             except (KeyError, TypeError, ValueError) as error:
                 remedy = "must have spacing and gravity [dim]; generate the shard again"
                 raise InputError(reader.path, f"{index:06d}/scene", str(error), remedy) from None
@@ -244,7 +256,7 @@ class Dataset:
                 if value != first[name]:
                     remedy = f"the first trajectory of the split has {first[name]}; one data set, one {name}"
                     raise InputError(reader.path, f"{index:06d}/{name}", value, remedy)
-        self.common = first
+        self.common, self.period = first, periodic.period(first, first["bounds"])
 
     def __len__(self) -> int:
         return len(self.entries)
@@ -309,7 +321,7 @@ class Dataset:
         for number, (frames, _, _) in enumerate(self.shapes):
             if frames <= 2 * stride:
                 continue
-            position = self._moving(number).astype(float)
+            position = periodic.unwrapped(self._moving(number).astype(float), self.period)
             step = position[stride:] - position[:-stride]
             velocity.add(step)
             acceleration.add(step[stride:] - step[:-stride])
@@ -398,18 +410,23 @@ class Dataset:
         """[frames - 1]: largest displacement of a moving particle from one file frame to the next."""
         if number not in self._speeds:
             position = self._moving(number)
-            self._speeds[number] = np.sqrt(((position[1:] - position[:-1]) ** 2).sum(2).max(1, initial=0))
+            step = periodic.shortest(position[1:] - position[:-1], self.period)
+            self._speeds[number] = np.sqrt((step**2).sum(2).max(1, initial=0))
         return self._speeds[number]
 
     def batch(self, rows: np.ndarray, frames: int, stride: int = 1, mirror: np.ndarray | None = None) -> Windows:
         """The windows ``rows`` [examples, 2] (as ``windows`` returns them) as one ``Windows``.
 
-        mirror [examples, dim] bool: flip the window along these axes about the box centre, x -> lower + upper - x.
+        mirror [examples, dim] bool: flip the window along these axes about the box centre, x -> lower + upper - x. In a periodic box the motion
+        goes on through the faces, so that a model may take differences over time as they are.
         """
         blocks, kinds, contexts = [], [], []
         for row, (number, first) in enumerate(np.asarray(rows).tolist()):
             frame = slice(first, first + (frames - 1) * stride + 1, stride)
-            block = self.positions(number, frame.start, frame.stop, frame.step)
+            if self.period is None:
+                block = self.positions(number, frame.start, frame.stop, frame.step)
+            else:
+                block = periodic.unwrapped(self.positions(number, frame.start, frame.stop), self.period)[:: frame.step]
             if mirror is not None and mirror[row].any():
                 block = block.copy()  # never in place: the block may be the stored data
                 for axis in np.flatnonzero(mirror[row]):

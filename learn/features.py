@@ -10,10 +10,12 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Literal
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from learn.graph import Graph
+from sim import periodic
 from sim.trajectory import KINEMATIC_TYPE
 
 if TYPE_CHECKING:
@@ -75,11 +77,17 @@ class Features(nn.Module):
     relative places alone); relative_velocity: v_sender - v_receiver on the edges; ballistic: predictions start from gravity * dt^2, not from
     the mean acceleration; walls: that flight stops at the walls (slips along them), as the grid emulator's does, so that the stop need not
     be learnt.
+
+    Along the periodic axes of ``spec`` there are no wall distances, and pairs are taken by nearest images; positions go on through the faces.
+    ``bounds`` of the methods are [dim, 2], infinite along these axes, and ``period`` [dim] as in ``sim.periodic``. Raises ``ValueError``
+    for absolute places in a periodic box.
     """
 
     def __init__(self, spec: DataSpec, *, sigma: float, velocities: int, radius: float, wall_distance: float, scaling: InputScaling,
                  relative_velocity: bool, ballistic: bool, walls: bool = False, absolute: bool = False):
         super().__init__()
+        if absolute and spec.periodic:
+            raise ValueError("a periodic box has no absolute places; set encoder: relative")
         self.velocities, self.radius, self.wall_distance = velocities, radius, wall_distance
         self.scaling, self.relative_velocity, self.walls, self.absolute = scaling, relative_velocity, walls, absolute
         step = spec.frame_step * spec.stride
@@ -97,7 +105,9 @@ class Features(nn.Module):
         constant("acceleration_mean", spec.acceleration_mean)
         constant("acceleration_std", inflated(spec.acceleration_std))
         constant("acceleration_base", base)
-        constant("bounds", spec.bounds)
+        constant("bounds", periodic.walls(spec.bounds, spec.period).tolist())
+        self.walled = [axis for axis, name in enumerate(periodic.AXES[: spec.dim]) if name not in spec.periodic]
+        self.period = spec.period
         self.embedding = nn.Embedding(TYPE_SLOTS, TYPE_WIDTH) if len(spec.particle_types) > 1 else None
         self.kinematic = KINEMATIC_TYPE in spec.particle_types
         self.context = spec.context_mean is not None
@@ -105,8 +115,8 @@ class Features(nn.Module):
             constant("context_mean", spec.context_mean)
             constant("context_std", [max(s, SMALLEST_STD) for s in spec.context_std])
         shown = 1 if scaling == "last" else velocities
-        self.node_width = (shown + 2) * spec.dim + (TYPE_WIDTH if self.embedding else 0) + (len(spec.context_mean) if self.context else 0)
-        self.node_width += spec.dim if absolute else 0
+        self.node_width = shown * spec.dim + 2 * len(self.walled) + (TYPE_WIDTH if self.embedding else 0)
+        self.node_width += (len(spec.context_mean) if self.context else 0) + (spec.dim if absolute else 0)
         self.edge_width = 0 if absolute else spec.dim + 1 + (spec.dim if relative_velocity else 0)
 
     def moving(self, particle_type: Tensor) -> Tensor | None:
@@ -118,6 +128,7 @@ class Features(nn.Module):
         and for the absolute encoder the place, -1 to 1 along every axis of the training data's box.
 
         position [C + 1, particles, dim], length; particle_type [particles] int64; bounds [dim, 2], length; context [particles, c].
+        Axes without walls have no wall distances.
         """
         velocity = position.diff(dim=0)
         scaled = (velocity - self.velocity_mean) / self.velocity_std
@@ -127,8 +138,11 @@ class Features(nn.Module):
             motion = [*((velocity.diff(dim=0) - self.acceleration_mean) / self.acceleration_std), scaled[-1]]
         else:
             motion = [scaled[-1]]
-        wall = torch.cat([position[-1] - bounds[:, 0], bounds[:, 1] - position[-1]], 1)
-        columns = [*motion, (wall / self.wall_distance).clamp(-1, 1)]
+        columns = motion
+        if self.walled:
+            place, bounds = (position[-1], bounds) if self.period is None else (position[-1][:, self.walled], bounds[self.walled])
+            wall = torch.cat([place - bounds[:, 0], bounds[:, 1] - place], 1)
+            columns = [*motion, (wall / self.wall_distance).clamp(-1, 1)]
         if self.embedding is not None:
             columns.append(self.embedding(particle_type))
         if self.context:
@@ -137,10 +151,10 @@ class Features(nn.Module):
             columns.append(2 * (position[-1] - self.bounds[:, 0]) / (self.bounds[:, 1] - self.bounds[:, 0]) - 1)
         return torch.cat([column.to(self.velocity_std.dtype) for column in columns], 1)
 
-    def edges(self, position: Tensor, graph: Graph) -> Tensor:
+    def edges(self, position: Tensor, graph: Graph, period: np.ndarray | None = None) -> Tensor:
         """[edges, edge_width]: (x_sender - x_receiver) / radius, its norm, and optionally (v_sender - v_receiver) / velocity std.
 
-        position [C + 1, particles, dim], length. The absolute encoder sees none.
+        position [C + 1, particles, dim], length; period [dim] of a periodic box. The absolute encoder sees none.
         """
         if self.absolute:
             return self.velocity_std.new_empty(graph.edges, 0)
@@ -148,7 +162,12 @@ class Features(nn.Module):
         def difference(values: Tensor) -> Tensor:
             return values.index_select(0, graph.sender) - values.index_select(0, graph.receiver)
 
-        offset = difference(position[-1]) / self.radius
+        offset = difference(position[-1])
+        if period is not None:
+            # Where there are walls the period is 0, and no turn is taken.
+            length = torch.as_tensor(period, dtype=offset.dtype, device=offset.device)
+            offset = offset - length * (offset / length.where(length > 0, torch.inf)).round()
+        offset = offset / self.radius
         # Self edges have offset 0, where the norm has no gradient: vector_norm gives 0 there.
         columns = [offset, torch.linalg.vector_norm(offset, dim=1, keepdim=True)]
         if self.relative_velocity:

@@ -27,6 +27,7 @@ from torch.nn import functional as F
 from learn.features import Features, InputScaling, NoiseScheme, velocity_noise
 from learn.graph import Graph, radius_graph
 from learn.relaxation import Relaxation, relax
+from sim import periodic
 from sim.simulator import SimulationError, Start
 from sim.trajectory import KINEMATIC_TYPE
 
@@ -304,8 +305,8 @@ class GNS(nn.Module):
         calls = len(windows.position) - given
         for call in range(1, calls + 1):
             context = windows.context[given + call - 2][windows.example] if self.features.context else None
-            graph = radius_graph(position[-1], self.radius, windows.example, self.options.self_edges)
-            output = self._predict(position, graph, windows.particle_type, self.features.bounds, context)
+            graph = radius_graph(position[-1], self.radius, windows.example, self.options.self_edges, self.features.period)
+            output = self._predict(position, graph, windows.particle_type, self.features.bounds, context, self.features.period)
             following = windows.position[given + call - 1] + noise[-1]
             error = (output - self.features.target(position, following)) / (call * (call + 1) / 2)
             square = error.square().sum(1)
@@ -319,8 +320,10 @@ class GNS(nn.Module):
                 position = torch.cat([position[1:], predicted[None]])
         return total / calls
 
-    def _predict(self, position: Tensor, graph: Graph, particle_type: Tensor, bounds: Tensor, context: Tensor | None) -> Tensor:
-        output = self.network(self.features.nodes(position, particle_type, bounds, context), self.features.edges(position, graph), graph)
+    def _predict(
+        self, position: Tensor, graph: Graph, particle_type: Tensor, bounds: Tensor, context: Tensor | None, period: np.ndarray | None
+    ) -> Tensor:
+        output = self.network(self.features.nodes(position, particle_type, bounds, context), self.features.edges(position, graph, period), graph)
         if self.options.flight_below:
             neighbours = graph.offsets.diff() - int(self.options.self_edges)
             output = output * (neighbours >= self.options.flight_below)[:, None]
@@ -335,6 +338,9 @@ class GNS(nn.Module):
             raise ValueError(f"the start has {len(start.history)} frames, the model needs {self.history}")
         if not math.isclose(start.frame_step, spec.frame_step, rel_tol=1e-6):
             raise ValueError(f"the start's frame step is {start.frame_step} s, the model's {spec.frame_step} s")
+        axes = periodic.axes(start.scene)
+        if axes != spec.periodic:
+            raise ValueError(f"the start's box is periodic along {list(axes)}, the model's along {list(spec.periodic)}")
         unknown = sorted(set(np.unique(start.particle_type).tolist()) - set(spec.particle_types))
         if unknown:
             raise ValueError(f"particle types {unknown} are not among the model's {list(spec.particle_types)}")
@@ -343,7 +349,7 @@ class GNS(nn.Module):
         frames = start.history[len(start.history) - self.history :: spec.stride].astype(np.float64)
         self._position = torch.from_numpy(frames).to(device)
         self._type = torch.from_numpy(start.particle_type.astype(np.int64)).to(device)
-        self._bounds = torch.as_tensor(np.asarray(start.bounds, np.float64), device=device)
+        self._bounds = torch.as_tensor(start.walls, device=device)
         self._start, self._present, self._first_edges = start, start.present, None
 
     @torch.inference_mode()
@@ -358,11 +364,11 @@ class GNS(nn.Module):
         if self.features.context:
             row = torch.as_tensor(start.context[min(self._present, len(start.context) - 1)], device=self._position.device)
             context = row.expand(count, -1)
-        graph = radius_graph(self._position[-1], self.radius, self_edges=self.options.self_edges)
+        graph = radius_graph(self._position[-1], self.radius, self_edges=self.options.self_edges, period=start.period)
         self._first_edges = self._first_edges or max(graph.edges, count)  # without self edges there may be none at first
         if graph.edges > self.options.edge_cap * self._first_edges:
             raise SimulationError(f"particles clump: {graph.edges} edges, {self.options.edge_cap:g} x the {self._first_edges} of the start exceeded")
-        output = self._predict(self._position, graph, self._type, self._bounds, context)
+        output = self._predict(self._position, graph, self._type, self._bounds, context, start.period)
         last = self._position[-1]
         acceleration = self.features.acceleration(output, self._position, self._bounds)
         following = 2 * last - self._position[-2] + acceleration
@@ -373,7 +379,7 @@ class GNS(nn.Module):
             following[self._type == KINEMATIC_TYPE] = known[-1]
         if self.options.relaxation is not None:
             fixed = None if known is None else (self._type == KINEMATIC_TYPE).cpu().numpy()
-            relaxed = relax(following.cpu().numpy(), start.bounds, self.spec.spacing, self.options.relaxation, fixed)
+            relaxed = relax(following.cpu().numpy(), start.bounds, self.spec.spacing, self.options.relaxation, fixed, start.period)
             following = torch.from_numpy(relaxed).to(last.device)
         gravity = torch.as_tensor(start.gravity * (start.frame_step * stride) ** 2, dtype=last.dtype, device=last.device)
         fall = acceleration.to(last.dtype).clamp(gravity.clamp(max=0), gravity.clamp(min=0))
@@ -383,4 +389,4 @@ class GNS(nn.Module):
             frames[:, self._type == KINEMATIC_TYPE] = known
         self._position = torch.cat([self._position[1:], frames[-1:]])
         self._present += stride
-        return frames.to("cpu", torch.float32).numpy()
+        return periodic.wrapped(frames.cpu().numpy(), start.bounds, start.period).astype(np.float32)

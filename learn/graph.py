@@ -11,8 +11,9 @@ from functools import cached_property
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
+
+from sim import periodic
 
 #: Edges that pass through the layers of an edge MLP together: few enough to stay in a cache of a few MiB, enough to hide the cost of a call.
 RUN = 2048
@@ -78,12 +79,14 @@ class Run:
     pairs: Tensor
 
 
-def radius_graph(position: Tensor, radius: float, example: Tensor | None = None, self_edges: bool = True) -> Graph:
+def radius_graph(
+    position: Tensor, radius: float, example: Tensor | None = None, self_edges: bool = True, period: np.ndarray | None = None
+) -> Graph:
     """All ordered pairs with |x_i - x_j| <= radius, no cap on the neighbours (Sanchez-Gonzalez et al. 2020).
 
     position [particles, dim], length; radius: length; example [particles], ascending: pairs join only within one example (None: there
-    is one); self_edges: every particle also sends to itself. Distances are taken in float64 of the given positions. Raises ``ValueError``
-    on a position that is not finite.
+    is one); self_edges: every particle also sends to itself; period [dim] of a periodic box: distances are those of nearest images. They are
+    taken in float64 of the given positions. Raises ``ValueError`` on a position that is not finite.
     """
     points = position.detach().cpu().numpy().astype(np.float64)
     count = len(points)
@@ -94,7 +97,7 @@ def radius_graph(position: Tensor, radius: float, example: Tensor | None = None,
     else:
         label = example.cpu().numpy()
         bounds = np.r_[0, np.flatnonzero(np.diff(label)) + 1, count]
-    trees = ((a, cKDTree(points[a:b])) for a, b in zip(bounds[:-1], bounds[1:], strict=True))
+    trees = ((a, periodic.tree(points[a:b], period)) for a, b in zip(bounds[:-1], bounds[1:], strict=True))
     pairs = np.concatenate([tree.query_pairs(radius, output_type="ndarray") + a for a, tree in trees])
     low, high = pairs[:, 0], pairs[:, 1]
     key = np.concatenate([low * count + high, high * count + low, np.arange(count if self_edges else 0) * (count + 1)])

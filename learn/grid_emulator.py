@@ -34,6 +34,7 @@ from torch.nn import functional
 from learn.dataset import DataSpec, Windows
 from learn.features import random_walk_noise
 from learn.relaxation import Relaxation, relax
+from sim.errors import InputError
 from sim.simulator import Start
 from sim.trajectory import KINEMATIC_TYPE
 
@@ -229,6 +230,8 @@ class GridEmulator(nn.Module):
 
     def __init__(self, settings: GridEmulatorSettings, spec: DataSpec):
         super().__init__()
+        if spec.periodic:
+            raise InputError("grid_emulator", "periodic", list(spec.periodic), "its grid ends at walls all around; train a gns on periodic boxes")
         self.options, self.spec = settings, spec
         self.settings = settings.model_dump()
         dim, m = spec.dim, settings.frames_per_call

@@ -19,7 +19,7 @@ from torch import nn
 
 from learn.checkpoint import file_hash, load_model
 from learn.dataset import Dataset
-from sim import __version__
+from sim import __version__, periodic
 from sim.errors import InputError, RunError
 from sim.generate import trajectory_seed
 from sim.scene import SceneFamily
@@ -94,7 +94,8 @@ def rollout_scene(
     drawn = [family.sample(trajectory_seed(seed, "test", index), "test") for index in range(count)]
     for one in drawn:
         context = one.context_values()
-        _check_fit(model, scene, checkpoint, {"dim": one.dim, "frame_step": one.frame_step}, set(one.particle_type().tolist()),
+        common = {"dim": one.dim, "frame_step": one.frame_step, "periodic": periodic.axes(one.to_dict())}
+        _check_fit(model, scene, checkpoint, common, set(one.particle_type().tolist()),
                    0 if context is None else context.shape[1])  # fmt: skip
     with tempfile.TemporaryDirectory() as folder:
         command = [sys.executable, "-m", "sim", "generate", str(scene), "--split", "test", "--count", str(count), "--seed", str(seed),
@@ -143,7 +144,7 @@ def check_fit(model: nn.Module, dataset: Dataset, checkpoint: object) -> None:
 
 
 def _check_fit(model: nn.Module, where: object, checkpoint: object, common: dict, types: set[int], context: int) -> None:
-    for name in ("dim", "frame_step"):
+    for name in ("dim", "frame_step", "periodic"):
         own = getattr(model.spec, name)
         if own != common[name]:
             raise InputError(where, name, common[name], f"{checkpoint} was trained with {own}; use data of the same {name}")

@@ -20,6 +20,11 @@ if TYPE_CHECKING:
 AXES = "xyz"
 
 
+def axes(scene: dict) -> tuple[str, ...]:
+    """The periodic axes of a resolved scene, in their order."""
+    return tuple(axis for axis in AXES if axis in scene.get("periodic", ()))
+
+
 def period(scene: object, bounds: np.ndarray) -> np.ndarray | None:
     """The period of a resolved scene (a dict) within ``bounds`` [dim, 2]."""
     axes = scene.get("periodic") if isinstance(scene, dict) else None
