@@ -28,25 +28,21 @@ pass one by one; memory is a few times the largest.
 
 from __future__ import annotations
 
-import io
 import math
 import os
 import pickle
-import shutil
 import struct
 import zipfile
 from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import h5py
 import numpy as np
 
 from sim import __version__, periodic
 from sim.errors import InputError, RunError
 from sim.generate import SPLITS, read_content
-from sim.trajectory import ShardReader, flush, write_json
+from sim.trajectory import ShardReader, atomic_folder, new_hdf5, write_json
 
 VIEWER_FORMATS = ("vtkhdf", "ply", "vtu")
 LEARNER_FORMATS = ("geoelements", "deepmind", "lagrangebench")
@@ -112,7 +108,7 @@ def export(
     # Everything that can be wrong with the request is found before anything is written.
     metadata = None if viewer else _metadata(found, format, exported)
     try:
-        with _new_folder(out) as folder:
+        with atomic_folder(out) as folder:
             if viewer:
                 for name, reader, number in _trajectories(found, index):
                     _write_for_viewers(folder / name / f"{number:06d}", format, reader, number, chosen)
@@ -124,24 +120,6 @@ def export(
     except OSError as error:
         raise RunError(f"{out}: cannot be written: {error.strerror or ' '.join(str(error).split())}") from None
     return exported
-
-
-@contextmanager
-def _new_folder(path: Path) -> Iterator[Path]:
-    """Yield a temporary folder beside ``path``; on success flush its files and rename it, on any error remove it. Complete or absent."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        temporary.mkdir(parents=True)
-    except OSError as error:
-        raise InputError(path, "out", str(path), f"cannot be written ({error.strerror}); give another folder") from None
-    try:
-        yield temporary
-        for file in temporary.rglob("*"):
-            if file.is_file():
-                flush(file)
-        os.replace(temporary, path)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def _slice(text: str) -> slice:
@@ -302,7 +280,7 @@ def _write_vtkhdf(
     """
     count, particles = len(frames), position.shape[1]
     moving, shared = np.arange(count) * particles, np.zeros(count, np.int64)
-    with _hdf5(path) as (file, disk):
+    with new_hdf5(path) as (file, disk):
         root = file.create_group("VTKHDF")
         root.attrs["Version"] = np.array([2, 0], np.int64)
         root.attrs["Type"] = np.bytes_("PolyData")  # VTK reads ASCII of fixed length only
@@ -576,7 +554,7 @@ def _write_lagrangebench(path: Path, trajectories: _Split) -> None:
 
     Uncompressed and contiguous, since windows are read. The format has no place for a context.
     """
-    with _hdf5(path) as (file, disk):
+    with new_hdf5(path) as (file, disk):
         for number, (position, kinds, _) in enumerate(trajectories):
             group = file.create_group(f"{number:05d}")
             group.create_dataset("position", data=position)
@@ -589,48 +567,3 @@ _LEARNERS: dict[str, tuple[str, Callable[[Path, _Split], None]]] = {
     "deepmind": (".tfrecord", _write_tfrecord),
     "lagrangebench": (".h5", _write_lagrangebench),
 }
-
-
-# --- HDF5 ------------------------------------------------------------------------------------------------------------
-
-
-class _Disk(io.FileIO):
-    """A file for HDF5 to write to. What goes wrong below HDF5 (a full disk, Ctrl-C) would end the process with a segmentation fault;
-    here it is kept for ``check``, and nothing more is written.
-    """
-
-    error: BaseException | None = None
-
-    def write(self, data: memoryview) -> int:
-        try:
-            rest = memoryview(data).cast("B")
-            while self.error is None and rest:
-                rest = rest[super().write(rest) :]
-        except BaseException as error:
-            self.error = error
-        return len(data)
-
-    def truncate(self, size: int | None = None) -> int:
-        try:
-            return super().truncate(size)
-        except BaseException as error:
-            self.error = self.error or error
-            return size
-
-    def check(self) -> None:
-        """Raise what went wrong."""
-        if self.error is not None:
-            raise self.error
-
-
-@contextmanager
-def _hdf5(path: Path) -> Iterator[tuple[h5py.File, _Disk]]:
-    """Yield a new HDF5 file and the disk below it, to be checked now and then; raises ``OSError`` where something could not be written."""
-    with _Disk(path, "w+") as disk:
-        try:
-            with h5py.File(disk, "w", libver=("v108", "v110")) as file:
-                yield file, disk
-        except (OSError, RuntimeError):
-            disk.check()  # the cause, where there is one
-            raise
-        disk.check()

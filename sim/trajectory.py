@@ -11,9 +11,11 @@ what the seed determines: a resumed run must give the same bytes as an unbroken 
 
 from __future__ import annotations
 
+import io
 import json
 import os
-from collections.abc import Iterator
+import shutil
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -91,6 +93,66 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
+@contextmanager
+def atomic_folder(path: Path) -> Iterator[Path]:
+    """Yield a temporary folder beside ``path``; on success flush its files and rename it, on any error remove it. Complete or absent."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        temporary.mkdir(parents=True)
+    except OSError as error:
+        raise InputError(path, "out", str(path), f"cannot be written ({error.strerror}); give another folder") from None
+    try:
+        yield temporary
+        for file in temporary.rglob("*"):
+            if file.is_file():
+                flush(file)
+        os.replace(temporary, path)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+class Disk(io.FileIO):
+    """A file for HDF5 to write to. What goes wrong below HDF5 (a full disk, Ctrl-C) would end the process with a segmentation fault;
+    here it is kept for ``check``, and nothing more is written.
+    """
+
+    error: BaseException | None = None
+
+    def write(self, data: memoryview) -> int:
+        try:
+            rest = memoryview(data).cast("B")
+            while self.error is None and rest:
+                rest = rest[super().write(rest) :]
+        except BaseException as error:
+            self.error = error
+        return len(data)
+
+    def truncate(self, size: int | None = None) -> int:
+        try:
+            return super().truncate(size)
+        except BaseException as error:
+            self.error = self.error or error
+            return size
+
+    def check(self) -> None:
+        """Raise what went wrong."""
+        if self.error is not None:
+            raise self.error
+
+
+@contextmanager
+def new_hdf5(path: Path) -> Iterator[tuple[h5py.File, Disk]]:
+    """Yield a new HDF5 file and the disk below it, to be checked now and then; raises ``OSError`` where something could not be written."""
+    with Disk(path, "w+") as disk:
+        try:
+            with h5py.File(disk, "w", libver=("v108", "v110")) as file:
+                yield file, disk
+        except (OSError, RuntimeError):
+            disk.check()  # the cause, where there is one
+            raise
+        disk.check()
+
+
 def write_text(path: str | Path, text: str) -> None:
     """Write a text file atomically."""
     with atomic_path(path) as temporary:
@@ -102,37 +164,35 @@ def write_json(path: str | Path, content: object) -> None:
     write_text(path, json.dumps(content, indent=1, sort_keys=True, allow_nan=False) + "\n")
 
 
-def write_shard(path: str | Path, trajectories: dict[int, Trajectory]) -> None:
-    """Write a shard atomically: ``{index: trajectory}``. The bytes depend on the trajectories alone. Raises ``OSError``.
+def write_shard(path: str | Path, trajectories: dict[int, Trajectory] | Iterable[tuple[int, Trajectory]]) -> None:
+    """Write a shard atomically: ``{index: trajectory}``, or pairs by ascending index that are made as they are written, one in memory at a time.
 
-    The file is built in memory: on a full disk HDF5 raises a bare RuntimeError, and may do so again when the file is closed.
+    The bytes depend on the trajectories alone. Raises ``OSError``.
     """
-    with atomic_path(path) as temporary:
-        with h5py.File(temporary.name, "w", driver="core", backing_store=False, libver=("v108", "v110")) as file:
-            file.attrs["format_version"] = FORMAT_VERSION
-            file.attrs["particle_types"] = json.dumps(PARTICLE_TYPES, sort_keys=True)
-            for index in sorted(trajectories):
-                trajectory = trajectories[index]
-                group = file.create_group(f"{index:06d}")
-                group.create_dataset("position", data=np.ascontiguousarray(trajectory.position, np.float32))
-                group.create_dataset("particle_type", data=np.asarray(trajectory.particle_type, np.int8))
-                if trajectory.context is not None:
-                    group.create_dataset("context", data=np.asarray(trajectory.context, np.float32))
-                for name in sorted(trajectory.diagnostics):
-                    group.create_dataset(f"diagnostics/{name}", data=np.asarray(trajectory.diagnostics[name], np.float64))
-                meta = {
-                    "frame_step": float(trajectory.frame_step),
-                    "radius": float(trajectory.radius),
-                    "bounds": np.asarray(trajectory.bounds, float).tolist(),
-                    "scene": trajectory.scene,
-                    "seed": int(trajectory.seed),
-                    "simulator": trajectory.simulator,
-                    "status": trajectory.status,
-                }
-                group.attrs["meta"] = json.dumps(meta, sort_keys=True)
-            file.flush()
-            image = file.id.get_file_image()
-        temporary.write_bytes(image)
+    if isinstance(trajectories, dict):
+        trajectories = sorted(trajectories.items())
+    with atomic_path(path) as temporary, new_hdf5(temporary) as (file, disk):
+        file.attrs["format_version"] = FORMAT_VERSION
+        file.attrs["particle_types"] = json.dumps(PARTICLE_TYPES, sort_keys=True)
+        for index, trajectory in trajectories:
+            group = file.create_group(f"{index:06d}")
+            group.create_dataset("position", data=np.ascontiguousarray(trajectory.position, np.float32))
+            group.create_dataset("particle_type", data=np.asarray(trajectory.particle_type, np.int8))
+            if trajectory.context is not None:
+                group.create_dataset("context", data=np.asarray(trajectory.context, np.float32))
+            for name in sorted(trajectory.diagnostics):
+                group.create_dataset(f"diagnostics/{name}", data=np.asarray(trajectory.diagnostics[name], np.float64))
+            meta = {
+                "frame_step": float(trajectory.frame_step),
+                "radius": float(trajectory.radius),
+                "bounds": np.asarray(trajectory.bounds, float).tolist(),
+                "scene": trajectory.scene,
+                "seed": int(trajectory.seed),
+                "simulator": trajectory.simulator,
+                "status": trajectory.status,
+            }
+            group.attrs["meta"] = json.dumps(meta, sort_keys=True)
+            disk.check()
 
 
 def _check(condition: bool, path: Path, key: str, value: object, remedy: str) -> None:

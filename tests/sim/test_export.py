@@ -27,6 +27,7 @@ from vtkmodules.vtkCommonExecutionModel import vtkStreamingDemandDrivenPipeline 
 from vtkmodules.vtkIOHDF import vtkHDFReader
 
 import sim.export
+import sim.trajectory
 from sim.cli import main
 from sim.errors import InputError, RunError
 from sim.export import FORMATS, LEARNER_FORMATS, VIEWER_FORMATS, crc32c, export, velocities
@@ -602,10 +603,11 @@ def test_a_full_disk_is_a_run_error_and_leaves_nothing(tmp_path):
 def test_writes_that_fail_late_or_in_part_are_noticed(tmp_path):
     """A write that takes less than it was given; what HDF5 writes only when it closes the file."""
     code = (
-        "import resource, sys\nfrom sim.export import _Disk, _hdf5\nresource.setrlimit(resource.RLIMIT_FSIZE, (5, resource.RLIM_INFINITY))\n"
-        "disk = _Disk(sys.argv[1], 'w+')\ndisk.write(b'ten bytes.')\n"
+        "import resource, sys\nfrom sim.trajectory import Disk, new_hdf5\nresource.setrlimit(resource.RLIMIT_FSIZE, (5, resource.RLIM_INFINITY))\n"
+        "disk = Disk(sys.argv[1], 'w+')\ndisk.write(b'ten bytes.')\n"
         "try:\n    disk.check()\nexcept OSError:\n    pass\nelse:\n    sys.exit('in part')\n"
-        "try:\n    with _hdf5(sys.argv[1]) as (file, disk):\n        file.create_group('a')\nexcept OSError:\n    pass\nelse:\n    sys.exit('late')\n"
+        "try:\n    with new_hdf5(sys.argv[1]) as (file, disk):\n        file.create_group('a')\n"
+        "except OSError:\n    pass\nelse:\n    sys.exit('late')\n"
     )
     assert_runs(code, tmp_path / "a.h5")
 
@@ -623,7 +625,7 @@ def test_a_failed_flush_leaves_nothing(data, tmp_path, monkeypatch):
 @pytest.mark.parametrize("name", ["vtkhdf", "lagrangebench"])
 def test_ctrl_c_below_hdf5_leaves_nothing(data, tmp_path, monkeypatch, name):
     """An exception in HDF5's own calls to the disk would be a failed write to it."""
-    monkeypatch.setattr(sim.export, "memoryview", lambda _: (_ for _ in ()).throw(KeyboardInterrupt), raising=False)
+    monkeypatch.setattr(sim.trajectory, "memoryview", lambda _: (_ for _ in ()).throw(KeyboardInterrupt), raising=False)
     with pytest.raises(KeyboardInterrupt):
         export(data, tmp_path / "out", name)
     assert os.listdir(tmp_path) == ["data"]
