@@ -191,9 +191,9 @@ def read_content(out: str | Path) -> dict:
     version = content.get("format_version") if isinstance(content, dict) else None
     if version != FORMAT_VERSION:
         raise InputError(path, "format_version", version, f"this version reads {FORMAT_VERSION}; generate the data set again")
-    outline = {"scene": str, "family": dict, "seed": int, "shard_size": int, "splits": dict}
+    outline = {"scene": str, "family": dict, "seed": int | None, "shard_size": int, "splits": dict}
     for key, kind in outline.items():
-        if not isinstance(content.get(key), kind):
+        if key not in content or not isinstance(content[key], kind):
             raise InputError(path, key, content.get(key), "missing or of the wrong kind; generate the data set again")
     return content
 

@@ -45,13 +45,13 @@ def _numbers(values: object) -> str:
 
 def _dataset_text(path: Path) -> str:
     content = read_content(path)
-    lines = [f"data set {path}: scene {content['scene']}, base seed {content['seed']}"]
+    seed = "imported" if content["seed"] is None else f"base seed {content['seed']}"
+    lines = [f"data set {path}: scene {content['scene']}, {seed}"]
     for split, entry in content["splits"].items():
         size = sum((path / shard).stat().st_size for shard in entry["shards"] if (path / shard).is_file())
-        lines.append(
-            f"  {split}: {entry['ok']} of {entry['trajectories']} trajectories in {len(entry['shards'])} shards, {size / 1e6:.1f} MB; "
-            f"solver {entry['cost']['wall_seconds']:.1f} s, set-up and compilation {entry['cost']['compile_seconds']:.1f} s"
-        )
+        cost = entry["cost"]
+        taken = f"; solver {cost['wall_seconds']:.1f} s, set-up and compilation {cost['compile_seconds']:.1f} s" if cost else ""
+        lines.append(f"  {split}: {entry['ok']} of {entry['trajectories']} trajectories in {len(entry['shards'])} shards, {size / 1e6:.1f} MB{taken}")
         lines += [f"    failed: {failure['index']} (seed {failure['seed']}): {failure['status']}" for failure in entry["failed"]]
     missing = [split for split in SPLITS if split not in content["splits"]]
     if missing:
@@ -160,7 +160,7 @@ def _dataset_faults(path: Path) -> Iterator[str]:
             continue
         if set(seeds) != set(range(count)) or entry.get("ok") != count - len(failed):
             yield f"{where}: {len(seeds)} trajectories found, {count} promised ({len(failed)} of them failed)"
-        elif split in SPLITS:
+        elif split in SPLITS and content["seed"] is not None:
             wrong = [index for index, seed in seeds.items() if seed != trajectory_seed(content["seed"], split, index)]
             if wrong:
                 yield f"{where}: trajectory {wrong[0]} has seed {seeds[wrong[0]]}, not the one its index gives"

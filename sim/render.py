@@ -527,7 +527,8 @@ def render_trajectory(path: str | Path, trajectory: Trajectory, *, width: int | 
     else:
         value = speeds(trajectory.position, frames, trajectory.frame_step, trajectory.moving)
         scale = speed_scale(value)
-    name = f"{trajectory.scene.get('name', 'scene')}, seed {trajectory.seed}, {trajectory.simulator.get('name', 'solver')}"
+    seed = "" if trajectory.seed is None else f", seed {trajectory.seed}"
+    name = f"{trajectory.scene.get('name', 'scene')}{seed}, {trajectory.simulator.get('name', 'solver')}"
     footers = [f"t = {frame * trajectory.frame_step:.3f} s" for frame in frames]
     if not trajectory.ok:
         footers[-1] += f"   {trajectory.status}"

@@ -40,7 +40,8 @@ class Trajectory:
 
     position [frames, particles, dim] float32; particle_type [particles] int8 (see ``PARTICLE_TYPES``); frame_step [s];
     radius: connectivity radius [length]; bounds [dim, 2]: inner faces of the container; context [frames, c] or None;
-    diagnostics: name -> [frames] float64; status: "ok" or "failed: why" (a failed trajectory keeps its finite frames).
+    seed: None where nobody knows it (imported data); diagnostics: name -> [frames] float64; status: "ok" or "failed: why" (a failed
+    trajectory keeps its finite frames).
     """
 
     position: np.ndarray
@@ -49,7 +50,7 @@ class Trajectory:
     radius: float
     bounds: np.ndarray
     scene: dict
-    seed: int
+    seed: int | None
     simulator: dict
     status: str = "ok"
     context: np.ndarray | None = None
@@ -91,6 +92,18 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def vacant(path: str | Path) -> Path:
+    """The absolute path of a folder that is new or empty; ``InputError`` for any other."""
+    path = Path(os.path.abspath(path))
+    try:
+        taken = path.exists() and (not path.is_dir() or any(path.iterdir()))
+    except OSError as error:
+        raise InputError(path, "out", str(path), f"cannot be looked into ({error.strerror}); give another folder") from None
+    if taken:
+        raise InputError(path, "out", str(path), "exists already; give a new folder")
+    return path
 
 
 @contextmanager
@@ -187,7 +200,7 @@ def write_shard(path: str | Path, trajectories: dict[int, Trajectory] | Iterable
                 "radius": float(trajectory.radius),
                 "bounds": np.asarray(trajectory.bounds, float).tolist(),
                 "scene": trajectory.scene,
-                "seed": int(trajectory.seed),
+                "seed": None if trajectory.seed is None else int(trajectory.seed),
                 "simulator": trajectory.simulator,
                 "status": trajectory.status,
             }
@@ -281,7 +294,8 @@ class ShardReader:
                 meta = json.loads(group.attrs["meta"])
                 position, kinds = group["position"], group["particle_type"]
                 bounds = np.asarray(meta["bounds"], float)
-                numbers = [float(meta["frame_step"]), float(meta["radius"]), int(meta["seed"])]
+                numbers = [float(meta["frame_step"]), float(meta["radius"])]
+                meta["seed"] = None if meta["seed"] is None else int(meta["seed"])
                 meta["simulator"], str(meta["status"])
                 axes = meta["scene"].get("periodic", []) if isinstance(meta["scene"], dict) else []
             shape = getattr(position, "shape", None)
@@ -337,6 +351,6 @@ class ShardReader:
         meta = self.meta(index)
         return Trajectory(
             position=self.positions(index), particle_type=self.particle_type(index), frame_step=float(meta["frame_step"]),
-            radius=float(meta["radius"]), bounds=np.asarray(meta["bounds"], float), scene=meta["scene"], seed=int(meta["seed"]),
+            radius=float(meta["radius"]), bounds=np.asarray(meta["bounds"], float), scene=meta["scene"], seed=meta["seed"],
             simulator=meta["simulator"], status=meta["status"], context=self.context(index), diagnostics=self.diagnostics(index),
         )
