@@ -29,7 +29,6 @@ pass one by one; memory is a few times the largest.
 from __future__ import annotations
 
 import math
-import os
 import pickle
 import struct
 import zipfile
@@ -42,7 +41,7 @@ import numpy as np
 from sim import __version__, periodic
 from sim.errors import InputError, RunError
 from sim.generate import SPLITS, read_content
-from sim.trajectory import ShardReader, atomic_folder, new_hdf5, write_json
+from sim.trajectory import ShardReader, atomic_folder, new_hdf5, vacant, write_json
 
 VIEWER_FORMATS = ("vtkhdf", "ply", "vtu")
 LEARNER_FORMATS = ("geoelements", "deepmind", "lagrangebench")
@@ -89,13 +88,7 @@ def export(
     """
     if format not in FORMATS:
         raise InputError("sluice-sim export", "format", format, f"give one of {', '.join(FORMATS)}")
-    out = Path(os.path.abspath(out))
-    try:
-        taken = out.exists() and (not out.is_dir() or any(out.iterdir()))
-    except OSError as error:
-        raise InputError(out, "out", str(out), f"cannot be looked into ({error.strerror}); give another folder") from None
-    if taken:
-        raise InputError(out, "out", str(out), "exists already; give a new folder")
+    out = vacant(out)
     viewer = format in VIEWER_FORMATS
     for key, value in {"index": index, "frames": frames}.items():
         if value is not None and not viewer:
@@ -471,9 +464,9 @@ def _write_tfrecord(path: Path, trajectories: _Split) -> None:
             lists = {name: b"".join(_field(1, _bytes_feature(frame.astype("<f4"))) for frame in frames) for name, frames in lists.items()}
             message = _field(1, _map(features)) + _field(2, _map(lists))
             length = struct.pack("<Q", len(message))
-            file.write(length + struct.pack("<I", _masked(crc32c(length))))
+            file.write(length + struct.pack("<I", masked(crc32c(length))))
             file.write(message)
-            file.write(struct.pack("<I", _masked(crc32c(message))))
+            file.write(struct.pack("<I", masked(crc32c(message))))
 
 
 def _varint(number: int) -> bytes:
@@ -500,7 +493,7 @@ def _map(entries: dict[str, bytes]) -> bytes:
     return b"".join(_field(1, _field(1, name.encode()) + _field(2, value)) for name, value in entries.items())
 
 
-def _masked(crc: int) -> int:
+def masked(crc: int) -> int:
     """TFRecord's masked CRC: turned right by 15 bits, plus a constant."""
     return ((crc >> 15 | crc << 17) + 0xA282EAD8) & 0xFFFFFFFF
 
