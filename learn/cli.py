@@ -1,6 +1,7 @@
-"""``sluice-learn``: train a model, roll one out, look into a checkpoint, exchange one with the PyTorch port of GNS.
+"""``sluice-learn``: turn others' data into ours, train a model, roll one out, look into a checkpoint, exchange one with the PyTorch port of GNS.
 
-Exit codes: 0 done; 1 failed while running (training diverged or was stopped; resume by the same command); 2 bad input, nothing written.
+Exit codes: 0 done; 1 failed while running (training diverged or was stopped; resume by the same command); 2 bad input, nothing written;
+130 interrupted.
 torch is imported by the commands, not here, so that ``--help`` is quick.
 """
 
@@ -8,9 +9,31 @@ from __future__ import annotations
 
 import argparse
 import json
+import signal
 import sys
 
 from sim.errors import InputError, RunError
+
+
+def _import(arguments: argparse.Namespace) -> None:
+    from sim.importing import TOLERANCE, import_data
+
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # unwound like Ctrl-C, so that what is half written goes
+    done = import_data(
+        arguments.source, arguments.out, arguments.format, gravity=arguments.gravity, spacing=arguments.spacing, trust_pickle=arguments.trust_pickle
+    )
+    counts = ", ".join(f"{split} {count}" for split, count in done.trajectories.items())
+    print(f"{arguments.out}: trajectories: {counts}; particle spacing {done.spacing:.4g} ({done.spacing_from})")
+    if done.statistics:
+        print("statistics of the training split, length per frame: found | stated by metadata.json")
+    for entry in done.statistics:
+        found, stated = (", ".join(f"{value:.4g}" for value in values or []) or "-" for values in (entry.found, entry.stated))
+        print(f"  {entry.name}: {found} | {stated}")
+    if done.doubtful:
+        worst = max(entry.deviation for entry in done.doubtful)
+        names = ", ".join(entry.name for entry in done.doubtful)
+        print(f"sluice-learn: {arguments.source}/metadata.json: {names}: up to {worst:.2g} standard deviations from those found "
+              f"({TOLERANCE:g} allowed); those found are used", file=sys.stderr)  # fmt: skip
 
 
 def _train(arguments: argparse.Namespace) -> None:
@@ -108,6 +131,18 @@ def parser() -> argparse.ArgumentParser:
     top = argparse.ArgumentParser(prog="sluice-learn", description="Train learned particle simulators and roll them out.")
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
+    text = "Turn a data set of another learner into one of ours: a folder with metadata.json and a file a split."
+    foreign = commands.add_parser("import", help="turn a data set of another learner into one of ours", description=text)
+    foreign.add_argument("source", metavar="SOURCE", help="its folder")
+    foreign.add_argument("--format", choices=("geoelements", "deepmind", "lagrangebench"), required=True, help="of train.npz, .tfrecord, .h5")
+    foreign.add_argument("--out", required=True, metavar="DIR", help="a new folder")
+    help_ = "one number an axis, length / s^2; no format says it; zeros for none"
+    foreign.add_argument("--gravity", type=float, nargs="+", required=True, metavar="G", help=help_)
+    foreign.add_argument("--spacing", type=float, help="of the particles, length; default: dx of lagrangebench, or measured in the first frame")
+    help_ = "read the pickles of geoelements; arrays and numbers alone are let through"
+    foreign.add_argument("--trust-pickle", action="store_true", help=help_)
+    foreign.set_defaults(act=_import)
+
     train = commands.add_parser("train", help="train a model, or resume the run in --out", description="Train a model, or resume the run in --out.")
     train.add_argument("config", metavar="CONFIG", help="a file of configs/models/")
     train.add_argument("--data", required=True, metavar="DIR", help="data set with the splits train and valid")
@@ -172,4 +207,7 @@ def main(arguments: list[str] | None = None) -> int:
     except (RunError, OSError) as error:
         print(f"sluice-learn: {error}", file=sys.stderr)
         return 1
+    except KeyboardInterrupt:
+        print("sluice-learn: interrupted", file=sys.stderr)
+        return 130
     return 0
