@@ -134,7 +134,8 @@ def parser() -> argparse.ArgumentParser:
     text = "Turn a data set of another learner into one of ours: a folder with metadata.json and a file a split."
     foreign = commands.add_parser("import", help="turn a data set of another learner into one of ours", description=text)
     foreign.add_argument("source", metavar="SOURCE", help="its folder")
-    foreign.add_argument("--format", choices=("geoelements", "deepmind", "lagrangebench"), required=True, help="of train.npz, .tfrecord, .h5")
+    help_ = "whose files it holds: train.npz, train.tfrecord, train.h5"
+    foreign.add_argument("--format", choices=("geoelements", "deepmind", "lagrangebench"), required=True, help=help_)
     foreign.add_argument("--out", required=True, metavar="DIR", help="a new folder")
     help_ = "one number an axis, length / s^2; no format says it; zeros for none"
     foreign.add_argument("--gravity", type=float, nargs="+", required=True, metavar="G", help=help_)
