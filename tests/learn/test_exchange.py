@@ -179,6 +179,7 @@ def test_files_that_are_not_there_or_not_theirs(tmp_path):
     ({"inputs": "last"}, {}, "inputs"), ({"relative_velocity": True}, {}, "relative_velocity"), ({"ballistic": True, "walls": True}, {}, "walls"),
     ({"self_edges": False}, {}, "self_edges"), ({"encoder": "absolute"}, {}, "encoder"),
     ({"ballistic": True, "flight_below": 2}, {}, "flight_below"), ({"relaxation": {}}, {}, "relaxation"), ({}, {"stride": 2}, "stride"),
+    ({}, {"periodic": ("x",)}, "periodic"),
     ({}, {"context_mean": (0.0, 0.0), "context_std": (1.0, 1.0)}, "context"),
 ])
 def test_what_the_port_cannot_be_is_refused(tmp_path, settings, changes, key):
