@@ -321,7 +321,7 @@ class GNS(nn.Module):
         return total / calls
 
     def _predict(
-        self, position: Tensor, graph: Graph, particle_type: Tensor, bounds: Tensor, context: Tensor | None, period: np.ndarray | None
+        self, position: Tensor, graph: Graph, particle_type: Tensor, bounds: Tensor, context: Tensor | None, period: np.ndarray | None = None
     ) -> Tensor:
         output = self.network(self.features.nodes(position, particle_type, bounds, context), self.features.edges(position, graph, period), graph)
         if self.options.flight_below:

@@ -76,7 +76,7 @@ def test_graph_against_brute_force(seed, count, radius, examples, axes):
     points = generator.uniform(-3, 6, (count, 3)).astype(np.float32)
     label = np.sort(generator.integers(0, examples, count))
     length = np.where([axis in axes for axis in "xyz"], [2.0, 3.0, 1.5], 0.0)
-    graph = radius_graph(torch.from_numpy(points), radius, torch.from_numpy(label), length)
+    graph = radius_graph(torch.from_numpy(points), radius, torch.from_numpy(label), period=length)
     shifts = np.stack(np.meshgrid(*[np.arange(-8, 9) if edge else [0] for edge in length]), -1).reshape(-1, 3) * length
     offset = points[:, None].astype(float) - points[None]
     distance = np.full((count, count), np.inf)
