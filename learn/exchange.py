@@ -151,7 +151,7 @@ def export_model(model: GNS, out: str | Path) -> dict:
     if spec.stride != 1:
         raise InputError("model", "data.stride", spec.stride, "geoelements/gns knows 1 only")
     if spec.periodic:
-        raise InputError("model", "periodic", spec.periodic, "geoelements/gns knows walls only")
+        raise InputError("model", "periodic", list(spec.periodic), "geoelements/gns knows walls all around only")
     if len(spec.context_mean or ()) > 1:
         raise InputError("model", "context", len(spec.context_mean), "geoelements/gns knows one number only, a material property")
     weights = port_weights(model)

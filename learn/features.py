@@ -79,14 +79,15 @@ class Features(nn.Module):
     be learnt.
 
     Along the periodic axes of ``spec`` there are no wall distances, and pairs are taken by nearest images; positions go on through the faces.
-    ``bounds`` of the methods are [dim, 2], infinite along these axes, and ``period`` [dim] as in ``sim.periodic``.
+    ``bounds`` of the methods are [dim, 2], infinite along these axes, and ``period`` [dim] as in ``sim.periodic``. Raises ``ValueError``
+    for absolute places in a periodic box.
     """
 
     def __init__(self, spec: DataSpec, *, sigma: float, velocities: int, radius: float, wall_distance: float, scaling: InputScaling,
                  relative_velocity: bool, ballistic: bool, walls: bool = False, absolute: bool = False):
         super().__init__()
         if absolute and spec.periodic:
-            raise ValueError("places in a periodic box are no features, for it has no origin; set encoder: relative")
+            raise ValueError("a periodic box has no absolute places; set encoder: relative")
         self.velocities, self.radius, self.wall_distance = velocities, radius, wall_distance
         self.scaling, self.relative_velocity, self.walls, self.absolute = scaling, relative_velocity, walls, absolute
         step = spec.frame_step * spec.stride

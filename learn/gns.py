@@ -318,7 +318,7 @@ class GNS(nn.Module):
         calls = len(windows.position) - given
         for call in range(1, calls + 1):
             context = windows.context[given + call - 2][windows.example] if self.features.context else None
-            graph = radius_graph(position[-1], self.radius, windows.example, self.features.period, self.options.self_edges)
+            graph = radius_graph(position[-1], self.radius, windows.example, self.options.self_edges, self.features.period)
             output = self._predict(position, graph, windows.particle_type, self.features.bounds, context, self.features.period)
             following = windows.position[given + call - 1] + noise[-1]
             error = (output - self.features.target(position, following)) / (call * (call + 1) / 2)
@@ -397,7 +397,7 @@ class GNS(nn.Module):
             rows = [state.start.context[min(state.present, len(state.start.context) - 1)] for state in states]
             context = torch.as_tensor(np.repeat(np.stack(rows), counts, axis=0), device=position.device)
         period = states[0].start.period
-        graph = radius_graph(position[-1], self.radius, example, period, self.options.self_edges)
+        graph = radius_graph(position[-1], self.radius, example, self.options.self_edges, period)
         ends = np.cumsum([0, *counts])
         edges = graph.offsets[torch.from_numpy(ends)].diff().tolist()
         failed: dict[int, SimulationError] = {}

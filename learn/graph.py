@@ -80,13 +80,13 @@ class Run:
 
 
 def radius_graph(
-    position: Tensor, radius: float, example: Tensor | None = None, period: np.ndarray | None = None, self_edges: bool = True
+    position: Tensor, radius: float, example: Tensor | None = None, self_edges: bool = True, period: np.ndarray | None = None
 ) -> Graph:
     """All ordered pairs with |x_i - x_j| <= radius, no cap on the neighbours (Sanchez-Gonzalez et al. 2020).
 
     position [particles, dim], length; radius: length; example [particles], ascending: pairs join only within one example (None: there
-    is one); period [dim] of a periodic box: distances are those of nearest images; self_edges: every particle also sends to itself. Distances
-    are taken in float64 of the given positions. Raises ``ValueError`` on a position that is not finite.
+    is one); self_edges: every particle also sends to itself; period [dim] of a periodic box: distances are those of nearest images. They are
+    taken in float64 of the given positions. Raises ``ValueError`` on a position that is not finite.
     """
     points = position.detach().cpu().numpy().astype(np.float64)
     count = len(points)

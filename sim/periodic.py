@@ -69,9 +69,9 @@ def wrapped(position: np.ndarray, bounds: np.ndarray, period: np.ndarray | None)
     if period is None:
         return position
     lower = np.asarray(bounds, float)[:, 0]
-    inside = np.mod(position - lower, np.where(period > 0, period, 1.0))
+    inside = np.mod(position - lower, np.where(period > 0, period, 1.0)) + lower
     # A hair below the lower face is rounded to the upper one.
-    return np.where(period > 0, np.where(inside == period, 0.0, inside) + lower, position).astype(position.dtype)
+    return np.where(period > 0, np.where(inside >= lower + period, lower, inside), position).astype(position.dtype)
 
 
 def tree(position: np.ndarray, period: np.ndarray | None) -> cKDTree:

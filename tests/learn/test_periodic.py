@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from learn import compare as c
 from learn import metrics
 from learn.baselines import ConstantVelocity, Oracle, RigidDrop, trivial_baselines
+from learn.checkpoint import build_model
 from learn.dataset import Dataset, DataSpec
 from learn.features import Features
 from learn.gns import GNS, Settings
@@ -75,7 +76,7 @@ def test_graph_against_brute_force(seed, count, radius, examples, axes):
     points = generator.uniform(-3, 6, (count, 3)).astype(np.float32)
     label = np.sort(generator.integers(0, examples, count))
     length = np.where([axis in axes for axis in "xyz"], [2.0, 3.0, 1.5], 0.0)
-    graph = radius_graph(torch.from_numpy(points), radius, torch.from_numpy(label), length)
+    graph = radius_graph(torch.from_numpy(points), radius, torch.from_numpy(label), period=length)
     shifts = np.stack(np.meshgrid(*[np.arange(-8, 9) if edge else [0] for edge in length]), -1).reshape(-1, 3) * length
     offset = points[:, None].astype(float) - points[None]
     distance = np.full((count, count), np.inf)
@@ -212,6 +213,8 @@ def test_a_box_of_another_kind_is_refused(tmp_path, write_dataset):
         small(spec(periodic=())).begin(start_from(flow(), 4))
     with pytest.raises(InputError, match="periodic = .*: its grid ends at walls all around; train a gns"):
         build("grid_emulator", {}, spec())
+    with pytest.raises(InputError, match="a periodic box has no absolute places; set encoder: relative"):
+        build_model("gns", {"encoder": "absolute"}, spec(), "gns.yaml")
 
 
 def test_baselines_and_the_oracle_go_through_the_faces():

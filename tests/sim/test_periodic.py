@@ -6,7 +6,7 @@ from dataclasses import replace
 import h5py
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from vtkmodules.util.numpy_support import vtk_to_numpy
 from vtkmodules.vtkIOHDF import vtkHDFReader
@@ -47,6 +47,7 @@ def test_where_there_are_walls_nothing_is_touched():
 
 
 @given(st.lists(st.tuples(st.floats(-40, 40), st.floats(-40, 40)), min_size=2, max_size=20))
+@example([(1 - 4.5e-16, 0.0), (1 - 2.2e-16, 0.0), (1 - 1e-17, 0.0)])
 def test_wrapping_and_unwrapping_change_images_only(rows):
     position = np.array(rows)[:, None]
     inside, smooth = periodic.wrapped(position, BOUNDS, PERIOD), periodic.unwrapped(position, PERIOD)
