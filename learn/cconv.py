@@ -443,7 +443,7 @@ def load_published(path: str | Path, spacing: float = 0.05, frame_step: float = 
     path = Path(path)
     content = read_content(path, "cpu", "published CConv", "copy the file again")
     weights = content.get("model", content) if isinstance(content, dict) else None
-    if not isinstance(weights, dict) or not all(isinstance(value, Tensor) for value in weights.values()):
+    if not isinstance(weights, dict) or not all(isinstance(name, str) and isinstance(value, Tensor) for name, value in weights.items()):
         raise InputError(path, "state_dict", type(weights).__name__, "must map names to tensors; give a file of the original's training program")
     remedy = "not the original's network; give a file of its training program"
 
@@ -471,14 +471,16 @@ def load_published(path: str | Path, spacing: float = 0.05, frame_step: float = 
     names = {"conv0_fluid": "fluid", "conv0_obstacle": "boundary", "dense0_fluid": "dense"}
     for k in range(1, count + 1):
         names |= {f"conv{k}": f"layers.{k - 1}.conv", f"dense{k}": f"layers.{k - 1}.dense"}
+    parts = {f"{module}.{part}" for module in names for part in ("bias", "kernel" if module.startswith("conv") else "weight")}
+    unfit = parts ^ {name for name in weights if name != "gravity" and not name.endswith(".offset")}
+    if unfit:
+        raise InputError(path, "names", sorted(map(str, unfit))[:5], f"missing from or unknown to a network of {count + 1} layers; {remedy}")
     own = {}
-    for name, value in weights.items():
-        module, _, part = name.rpartition(".")
-        if name == "gravity" or part == "offset":
-            continue
+    for name in parts:
+        (module, part), value = name.split("."), weights[name]
         if part == "kernel" and value.ndim == 5:
-            # [z, y, x, C_in, C_out] -> [C_in, cells, C_out]; the view keeps x the fastest.
+            # [z, y, x, C_in, C_out] -> [C_in, cells, C_out]; x stays the fastest.
             value = value.flatten(0, 2).transpose(0, 1)
-        own[f"network.{names.get(module, module)}.{'weight' if part == 'kernel' else part}"] = value.contiguous()
+        own[f"network.{names[module]}.{'weight' if part == 'kernel' else part}"] = value.contiguous()
     load_weights(model, own, path)
     return model.eval()
