@@ -338,13 +338,13 @@ class CConv(nn.Module):
         def pairs(offset: Tensor, outer: Tensor, inner: Tensor, size: tuple[int, int]) -> Pairs:
             return Pairs.between((offset / self.radius).to(self.gravity.dtype), outer, inner, size, self.options.kernel)
 
-        graph = radius_graph(position, self.radius, example)
+        graph = radius_graph(position, self.radius, example, self_edges=False)
         sender, receiver = graph.sender.long(), graph.receiver.long()
         offset = position.index_select(0, sender) - position.index_select(0, receiver)
         # Index of a particle among those that move, and among those that do not.
         rank = torch.where(moving, moving.cumsum(0), (~moving).cumsum(0)) - 1
         count = int(moving.sum())
-        among = (sender != receiver) & moving[sender] & moving[receiver]
+        among = moving[sender] & moving[receiver]
         fluid = pairs(offset[among], rank[receiver[among]], rank[sender[among]], (count, count))
         fixed = len(moving) - count
         beside = ~moving[sender] & moving[receiver]

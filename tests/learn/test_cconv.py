@@ -367,7 +367,7 @@ def test_damaged_and_hostile_weights_run_nothing(tmp_path, monkeypatch):
         else:
             assert all(value.shape == reference[name].shape and torch.isfinite(value).all() for name, value in found.items())
     torch.save({"conv0_fluid.kernel": _Evil()}, "weights.pt")
-    with pytest.raises(InputError, match="weights of a CConv"):
+    with pytest.raises(InputError, match="published CConv file"):
         load_published("weights.pt")
     assert not Path("ran").exists()
 
