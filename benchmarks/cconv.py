@@ -30,7 +30,7 @@ from scipy.spatial import cKDTree
 
 from learn.cconv import CConv, load_published
 from learn.figures import COLOURS
-from learn.relaxation import mirrors
+from learn.relaxation import images
 from sim.scene import Scene
 from sim.simulator import Start, rollout
 from sim.sph.solver import SPHSimulator
@@ -59,7 +59,7 @@ def density(position: np.ndarray) -> np.ndarray:
     def kernel(r: np.ndarray) -> np.ndarray:
         return (1 - r / SUPPORT) ** 4 * (1 + 4 * r / SUPPORT)
 
-    owner, sign, shift = mirrors(position, np.array([[0.0, length] for length in TANK]), SUPPORT)
+    owner, sign, shift = images(position, np.array([[0.0, length] for length in TANK]), SUPPORT, None)
     found = cKDTree(position).sparse_distance_matrix(cKDTree(position[owner] * sign + shift), SUPPORT, output_type="ndarray")
     axis = np.arange(-2, 3) * SPACING
     lattice = np.linalg.norm(np.stack(np.meshgrid(axis, axis, axis), -1).reshape(-1, 3), axis=1)

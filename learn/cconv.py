@@ -36,7 +36,6 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 import torch
 from pydantic import BaseModel, ConfigDict, Field, PositiveInt
-from scipy.spatial import cKDTree
 from torch import Tensor, nn
 from torch.nn.functional import relu
 
@@ -45,6 +44,7 @@ from learn.dataset import DataSpec
 from learn.features import SMALLEST_STD
 from learn.graph import radius_graph
 from learn.relaxation import Relaxation, relax
+from sim import periodic
 from sim.errors import InputError
 from sim.simulator import SimulationError, Start
 from sim.trajectory import KINEMATIC_TYPE, PARTICLE_TYPES
@@ -103,14 +103,18 @@ def ball_to_cube(x: Tensor) -> Tensor:
     return torch.cat([disc_to_square(plane * widen[:, None]), height[:, None]], 1)
 
 
-def wall_particles(bounds: np.ndarray, spacing: float) -> tuple[np.ndarray, np.ndarray]:
-    """Positions and inward unit normals, both [particles, dim], on the faces of a box, about ``spacing`` apart, none on an edge; bounds [dim, 2]."""
+def wall_particles(bounds: np.ndarray, spacing: float, period: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Positions and inward unit normals, both [particles, dim], on the walls of a box, about ``spacing`` apart, none on an edge.
+
+    bounds [dim, 2]; period [dim] as in ``sim.periodic``: a box that repeats itself along an axis has no walls across it.
+    """
     bounds = np.asarray(bounds, float)
     extent = bounds[:, 1] - bounds[:, 0]
     counts = np.maximum(np.round(extent / spacing), 1).astype(int)
     axes = [low + (np.arange(count) + 0.5) * length / count for low, count, length in zip(bounds[:, 0], counts, extent, strict=True)]
-    positions, normals = [], []
-    for axis, side in itertools.product(range(len(bounds)), range(2)):
+    positions, normals = [np.empty((0, len(bounds)))], [np.empty((0, len(bounds)))]
+    walled = [axis for axis in range(len(bounds)) if period is None or not period[axis]]
+    for axis, side in itertools.product(walled, range(2)):
         face = [*axes[:axis], bounds[axis, side : side + 1], *axes[axis + 1 :]]
         positions.append(np.stack(np.meshgrid(*face, indexing="ij"), -1).reshape(-1, len(bounds)))
         normals.append(np.broadcast_to(np.eye(len(bounds))[axis] * (1 - 2 * side), positions[-1].shape))
@@ -118,18 +122,27 @@ def wall_particles(bounds: np.ndarray, spacing: float) -> tuple[np.ndarray, np.n
 
 
 class Walls:
-    """The particles on the walls of a box, and which of them particles of the fluid see."""
+    """The particles on the walls of a box, and which of them particles of the fluid see; bounds [dim, 2], period [dim] as in ``sim.periodic``."""
 
-    def __init__(self, bounds: np.ndarray, spacing: float, radius: float):
-        self.bounds, self.radius = np.asarray(bounds, float), radius
-        self.position, self.normal = wall_particles(bounds, WALL_SPACING * spacing)
-        self._tree = cKDTree(self.position)
+    def __init__(self, bounds: np.ndarray, spacing: float, radius: float, period: np.ndarray | None = None):
+        self.period, self.radius = period, radius
+        self.bounds = periodic.walls(bounds, period)
+        self.position, self.normal = wall_particles(bounds, WALL_SPACING * spacing, period)
+        self._tree = periodic.tree(self.position, period)
 
     def pairs(self, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Indices of wall particles and of the ``position`` [n, dim] within ``radius`` of them, [pairs] each."""
         near = np.flatnonzero(((position - self.bounds[:, 0] < self.radius) | (self.bounds[:, 1] - position < self.radius)).any(1))
-        found = self._tree.sparse_distance_matrix(cKDTree(position[near]), self.radius, output_type="ndarray")
+        found = self._tree.sparse_distance_matrix(periodic.tree(position[near], self.period), self.radius, output_type="ndarray")
         return found["i"], near[found["j"]]
+
+    def shortest(self, offset: Tensor) -> Tensor:
+        """The shortest image of offsets [n, dim]."""
+        if self.period is None:
+            return offset
+        # Where there are walls the period is 0, and no turn is taken.
+        length = torch.as_tensor(self.period, dtype=offset.dtype, device=offset.device)
+        return offset - length * (offset / length.where(length > 0, torch.inf)).round()
 
 
 @dataclass(frozen=True)
@@ -302,7 +315,7 @@ class CConv(nn.Module):
     @cached_property
     def walls(self) -> Walls:
         """Those of the training data's box."""
-        return Walls(np.array(self.spec.bounds), self.spec.spacing, self.radius)
+        return Walls(np.array(self.spec.bounds), self.spec.spacing, self.radius, self.spec.period)
 
     def call(self, position: Tensor, following: Tensor, kind: Tensor, example: Tensor | None, walls: Walls,
              context: Tensor | None = None) -> tuple[Tensor, Tensor]:  # fmt: skip
@@ -336,9 +349,9 @@ class CConv(nn.Module):
     def _around(self, position: Tensor, moving: Tensor, example: Tensor | None, walls: Walls) -> tuple[Pairs, Tensor, Pairs]:
         """Pairs of moving particles, features of the boundary (kinematic particles, then walls), and its pairs with moving particles."""
         def pairs(offset: Tensor, outer: Tensor, inner: Tensor, size: tuple[int, int]) -> Pairs:
-            return Pairs.between((offset / self.radius).to(self.gravity.dtype), outer, inner, size, self.options.kernel)
+            return Pairs.between((walls.shortest(offset) / self.radius).to(self.gravity.dtype), outer, inner, size, self.options.kernel)
 
-        graph = radius_graph(position, self.radius, example, self_edges=False)
+        graph = radius_graph(position, self.radius, example, walls.period, self_edges=False)
         sender, receiver = graph.sender.long(), graph.receiver.long()
         offset = position.index_select(0, sender) - position.index_select(0, receiver)
         # Index of a particle among those that move, and among those that do not.
@@ -396,7 +409,7 @@ class CConv(nn.Module):
         frames = start.history[len(start.history) - self.history :: self.spec.stride].astype(np.float64)
         self._state = torch.from_numpy(frames).to(device)
         self._kind = torch.from_numpy(start.particle_type.astype(np.int64)).to(device)
-        self._walls = Walls(start.bounds, self.spec.spacing, self.radius)
+        self._walls = Walls(start.bounds, self.spec.spacing, self.radius, start.period)
         self._start, self._present, self._first_pairs = start, start.present, None
 
     @torch.inference_mode()
@@ -419,7 +432,7 @@ class CConv(nn.Module):
             raise SimulationError(f"particles clump: {pairs} pairs, {self.options.edge_cap:g} x the {self._first_pairs} of the start exceeded")
         if self.options.relaxation is not None:
             fixed = None if known is None else (self._kind == KINEMATIC_TYPE).cpu().numpy()
-            relaxed = relax(predicted.cpu().numpy(), start.bounds, self.spec.spacing, self.options.relaxation, fixed)
+            relaxed = relax(predicted.cpu().numpy(), start.bounds, self.spec.spacing, self.options.relaxation, fixed, start.period)
             predicted = torch.from_numpy(relaxed).to(now.device)
         share = torch.arange(1, stride + 1, dtype=now.dtype, device=now.device)[:, None, None] / stride
         frames = now + share * (predicted - now)
@@ -427,7 +440,7 @@ class CConv(nn.Module):
             frames[:, self._kind == KINEMATIC_TYPE] = known
         self._state = torch.stack([now, predicted])
         self._present += stride
-        return frames.to("cpu", torch.float32).numpy()
+        return periodic.wrapped(frames.cpu().numpy(), start.bounds, start.period).astype(np.float32)
 
 
 # -- published weights ---------------------------------------------------------------------------------------------------------------

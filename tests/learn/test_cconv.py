@@ -270,6 +270,25 @@ def test_order_translation_and_company_do_not_matter(dim):
     assert all((one - other).abs().max() > 1e-6 for one, other in ((apart, found[:1]), (lone, moved), (pushed, found)))
 
 
+@pytest.mark.parametrize("axes", [("x",), ("x", "y")])
+def test_a_periodic_box_has_no_seam(axes):
+    """Shifted along periodic axes, across the faces, a cloud behaves alike; walls remain across the others."""
+    model = awaken(small(2, {"periodic": axes})).double()
+    assert len(model.walls.position) == (2 - len(axes)) * 2 * round(1 / (0.05 * math.sqrt(math.pi / 1.9)))
+    position, kind = torch.stack([cloud(30, 2, seed) * 0.01 + cloud(30, 2, 5, 0.05, 0.6) for seed in (0, 1)]), torch.full((30,), 5)
+    found, neighbours = model.call(position, position[1], kind, None, model.walls)
+    shift = torch.tensor([0.8, 0.7 if "y" in axes else 0.0], dtype=torch.float64)
+    across, count = model.call(position + shift, position[1], kind, None, model.walls)
+    assert torch.allclose(across, found + shift, atol=1e-12) and torch.equal(count, neighbours)
+    # A step later, from places wrapped into the box.
+    scene = {"gravity": [0.0, GRAVITY], "periodic": list(axes)}
+    runs = [rollout(model, start(start_at.numpy(), scene=scene), 3).position for start_at in (position, position + shift)]
+    moved = runs[1] - runs[0] - shift.numpy()
+    np.testing.assert_allclose(moved, np.round(moved), atol=1e-5)
+    assert (np.abs(moved).max((0, 1)) > 0.5).tolist() == ["x" in axes, "y" in axes]
+    assert all(((run >= 0) & (run < 1))[..., : len(axes)].all() for run in runs)
+
+
 # Published weights -----------------------------------------------------------------------------------------------------------------
 
 
