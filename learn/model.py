@@ -43,7 +43,7 @@ class LearnedModel(Protocol):
 
 
 #: name -> module and class, imported when built.
-MODELS = {"gns": ("learn.gns", "GNS"), "grid_emulator": ("learn.grid_emulator", "GridEmulator")}
+MODELS = {"gns": ("learn.gns", "GNS"), "grid_emulator": ("learn.grid_emulator", "GridEmulator"), "cconv": ("learn.cconv", "CConv")}
 
 
 def model_class(name: str) -> type[LearnedModel]:

@@ -50,7 +50,7 @@ def relax(
     count, dim = position.shape
     reach = SUPPORT * spacing
     weight = (6 / (math.pi * SUPPORT**2)) if dim == 2 else 15 / (2 * math.pi * SUPPORT**3)
-    owner, sign, shift = _images(position, bounds, reach, period)
+    owner, sign, shift = images(position, bounds, reach, period)
     first, second = cKDTree(position[owner] * sign + shift).query_pairs(reach, output_type="ndarray").T
     # Both directions, towards particles only: an image moves with its owner.
     receiver, sender = np.concatenate([first, second]), np.concatenate([second, first])
@@ -74,7 +74,7 @@ def relax(
     return position + outside
 
 
-def _images(
+def images(
     position: np.ndarray, bounds: np.ndarray, reach: float, period: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The particles, then their images within ``reach`` of the box, corners included: owner [k], sign and shift [k, dim] (x sign + shift).
