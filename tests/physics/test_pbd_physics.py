@@ -64,7 +64,7 @@ def test_a_column_at_rest_keeps_its_height(counts, settled, flat, deep):
     for _ in range(120):
         heights.append(solver.frame()[:, 1].mean() / 0.4)
         found = solver.diagnostics()
-        assert found["density_error"] <= 1e-3 and found["density"] < 1.02
+        assert found["density_error"] <= 5e-4 and found["density"] < 1.02
     assert heights[-1] == pytest.approx(1 - settled, abs=0.005)
     assert abs(heights[-1] - heights[59]) < 2e-3
     assert found["kinetic_energy"] < 1e-3 * weight * 0.8
