@@ -227,7 +227,7 @@ class PositionBased(_Strict):
     method: Literal["pbf"]
     support: _Support = 2.0
     substeps: Annotated[int, Field(ge=1, le=1000)] = 2
-    density_error: Annotated[float, Field(gt=0, le=0.1)] = 1e-3
+    density_error: Annotated[float, Field(gt=0, le=0.1)] = 5e-4
     iterations: Annotated[int, Field(ge=1, le=10_000)] = 1000
     xsph: Annotated[float, Field(ge=0, lt=1)] = 0.01
     tensile: Annotated[float, Field(ge=0, le=0.02)] = 0.01

@@ -66,6 +66,11 @@ def _neighbours(dim: int, spacing: float) -> np.ndarray:
     return r[(length > 0) & (length < 1)]
 
 
+def _waves(dim: int, spacing: float) -> np.ndarray:
+    """[n, dim]: wave vectors of a lattice."""
+    return np.stack([axis.ravel() for axis in np.meshgrid(*[np.linspace(0, np.pi / spacing, 13)] * dim, indexing="ij")], 1)
+
+
 def lattice_shift(dim: int, spacing: float) -> float:
     """A by which a particle of a lattice may be moved at most, -A sum_j V grad W, lest what is uneven grows: 0.9 over the largest eigenvalue of
     -sum_j V (1 - cos k . r_j) grad grad W over all waves k. (Twice its inverse is the limit of stability.)"""
@@ -73,9 +78,16 @@ def lattice_shift(dim: int, spacing: float) -> float:
     length = np.linalg.norm(r, axis=1)
     across, bend = slope(dim, length), 60 * constant(dim) * length * (1 - length) ** 2
     hessian = bend[:, None, None] * r[:, :, None] * r[:, None, :] / (length**2)[:, None, None] - across[:, None, None] * np.eye(dim)
-    waves = np.stack([axis.ravel() for axis in np.meshgrid(*[np.linspace(0, np.pi / spacing, 13)] * dim, indexing="ij")], 1)
-    sums = np.einsum("kn,nij->kij", 1 - np.cos(waves @ r.T), hessian) * lattice_scale(dim, spacing) * spacing**dim
+    sums = np.einsum("kn,nij->kij", 1 - np.cos(_waves(dim, spacing) @ r.T), hessian) * lattice_scale(dim, spacing) * spacing**dim
     return float(0.9 / np.linalg.eigvalsh(sums).max())
+
+
+def lattice_relaxation(dim: int, spacing: float) -> float:
+    """Inverse of the largest eigenvalue on a lattice of A / D, by which displacements -sum_j (k_i + k_j) grad W_ij change densities, D its diagonal:
+    the step of a gradient method for k. Waves in k displace by the sines of k . r_j."""
+    r = _neighbours(dim, spacing)
+    gradient = slope(dim, np.linalg.norm(r, axis=1))[:, None] * r
+    return float((gradient**2).sum() / ((np.sin(_waves(dim, spacing) @ r.T) @ gradient) ** 2).sum(1).max())
 
 
 def _stretch(dim: int, spacing: float, s: np.ndarray) -> np.ndarray:

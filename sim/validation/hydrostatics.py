@@ -20,7 +20,7 @@ def run(resolution: int, method: str) -> Outcome:
     the first ten, of the particles of a layer of cells, as MPM's forces come from the grid. The same on the plane surface of an obstacle, which
     lies a quarter, half and three quarters of a cell above a line of nodes: the worst of the three. DFSPH has no c and does not ring, but its
     particles never come to rest; it gets the same time. The position-based solver has neither: its surface and rest alone, as its multipliers are
-    no measure of pressure and it knows no obstacles; 64 layers deep its Jacobi iterations, which reach a particle each, do not end in 1000."""
+    no measure of pressure and it knows no obstacles."""
     solver = solver_class(method)()
     curves, seconds, particles = _pool(resolution, method, solver)
     if method == "pbf":

@@ -53,8 +53,8 @@ def test_what_falls_freely_follows_the_parabola(dim, flat, deep):
 def test_a_column_at_rest_keeps_its_height(counts, settled, flat, deep):
     """Sixteen layers for two seconds: nearly still, never denser than the error that solves end at.
 
-    The lattice of the start is not how water at rest is packed: at the same density, as the kernel tells it, that has 1 % (2D) and 3 % (3D,
-    whatever the support of the kernel) more particles in a volume. The column settles by so much in the first second, and no further.
+    At walls and at the surface water gets closer than on the lattice of the start (``sim.pbd.solver``): the column settles by 1 % (2D) and 3 % (3D,
+    where it is narrow) in the first second, and no further.
     """
     dim = len(counts)
     what = scene([("water", [0] * dim, [counts[0], 16, 8][:dim])], 0.05, counts)
@@ -64,7 +64,7 @@ def test_a_column_at_rest_keeps_its_height(counts, settled, flat, deep):
     for _ in range(120):
         heights.append(solver.frame()[:, 1].mean() / 0.4)
         found = solver.diagnostics()
-        assert found["density_error"] <= 1e-3 and found["density"] < 1.02
+        assert found["density_error"] <= 5e-4 and found["density"] < 1.02
     assert heights[-1] == pytest.approx(1 - settled, abs=0.005)
     assert abs(heights[-1] - heights[59]) < 2e-3
     assert found["kinetic_energy"] < 1e-3 * weight * 0.8
