@@ -351,7 +351,7 @@ class CConv(nn.Module):
         def pairs(offset: Tensor, outer: Tensor, inner: Tensor, size: tuple[int, int]) -> Pairs:
             return Pairs.between((walls.shortest(offset) / self.radius).to(self.gravity.dtype), outer, inner, size, self.options.kernel)
 
-        graph = radius_graph(position, self.radius, example, walls.period, self_edges=False)
+        graph = radius_graph(position, self.radius, example, self_edges=False, period=walls.period)
         sender, receiver = graph.sender.long(), graph.receiver.long()
         offset = position.index_select(0, sender) - position.index_select(0, receiver)
         # Index of a particle among those that move, and among those that do not.
