@@ -23,7 +23,7 @@ from learn.rollout import rollout_trajectory
 from learn.train import rollout_score
 from sim import periodic
 from sim.errors import InputError
-from sim.simulator import rollout, start_from
+from sim.simulator import rollout, rollouts, start_from
 from sim.trajectory import Trajectory
 
 BOUNDS = np.array([[1.0, 5.0], [0.0, 2.0]])
@@ -206,6 +206,15 @@ def test_moving_obstacles_pass_through_the_faces_with_their_speed():
         result = rollout(model, start, 12).position[:, :2].astype(float)
         np.testing.assert_allclose(periodic.shortest(result - truth.position[present + 1 : present + 13, :2], PERIOD), 0, atol=1e-5)
     assert len(seen) == 24 and max(seen) < 1
+
+
+def test_rollouts_together_are_those_apart():
+    model, truths = small(radius=2.0), [flow(30, particles=8 + seed, seed=seed) for seed in range(3)]
+    starts = [start_from(truth, model.history) for truth in truths]
+    for together, start in zip(rollouts(model, starts, [20] * 3), starts, strict=True):
+        apart = rollout(model, start, 20).position
+        np.testing.assert_allclose(periodic.shortest(together.position.astype(float) - apart, PERIOD), 0, atol=1e-5)
+        assert together.escaped is None and np.abs(np.diff(apart, axis=0)).max() > 3
 
 
 def test_a_box_of_another_kind_is_refused(tmp_path, write_dataset):
