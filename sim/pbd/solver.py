@@ -686,6 +686,14 @@ class PBDSimulator:
         x, v, wall = (field.to_numpy()[:n][order].astype(float) for field in (kernels.x, kernels.v, kernels.wall))
         return {"position": self._lower + x[:, :dim] * h, "velocity": v[:, :dim] * h, "density": wall[:, 3]}
 
+    def inject(self, name: str, particle: int | np.ndarray, value) -> None:
+        """Overwrite ``position`` or ``velocity`` of a particle of water, or of several, as ``state`` gives them. For studies of what happens then."""
+        kernels, h = self._kernels, self._support
+        field, content = {"position": (kernels.x, (value - self._lower) / h), "velocity": (kernels.v, np.divide(value, h))}[name]
+        whole = field.to_numpy()
+        whole[np.flatnonzero(np.isin(kernels.id.to_numpy()[: len(self._position)], particle)), : self._scene.dim] = content
+        field.from_numpy(whole)
+
     def set_velocity(self, velocity: np.ndarray) -> None:
         """Replace the velocities [n, dim] of all particles; bodies take the rigid motion nearest to theirs. For starts that no scene describes."""
         self._kernels.replace((velocity / self._support).astype(np.float32))
