@@ -361,6 +361,14 @@ class _Kernels(Walls):
                     self.v[i][d] += self.shift[i][d] / dt
         if ti.static(self.structure.xsph):
             self.smooth(n)
+        for i in range(n):
+            if self.body[i] < 0:
+                for d in ti.static(range(self.dim)):
+                    # What came to a wall in this step has the velocity of its way there.
+                    if self.x[i][d] < self.extent[0][d] + ti.static(1.01 * HAIR):
+                        self.v[i][d] = ti.max(self.v[i][d], 0.0)
+                    if self.x[i][d] > self.extent[1][d] - ti.static(1.01 * HAIR):
+                        self.v[i][d] = ti.min(self.v[i][d], 0.0)
         if ti.static(self.structure.bodies > 0):
             for b in range(self.bodies.count[None]):
                 self.bodies.conclude(b, ti.cast(dt, ti.f64))
