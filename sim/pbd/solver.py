@@ -361,6 +361,14 @@ class _Kernels(Walls):
                     self.v[i][d] += self.shift[i][d] / dt
         if ti.static(self.structure.xsph):
             self.smooth(n)
+        for i in range(n):
+            if self.body[i] < 0:
+                for d in ti.static(range(self.dim)):
+                    # What came to a wall in this step has the velocity of its way there.
+                    if self.x[i][d] < self.extent[0][d] + ti.static(1.01 * HAIR):
+                        self.v[i][d] = ti.max(self.v[i][d], 0.0)
+                    if self.x[i][d] > self.extent[1][d] - ti.static(1.01 * HAIR):
+                        self.v[i][d] = ti.min(self.v[i][d], 0.0)
         if ti.static(self.structure.bodies > 0):
             for b in range(self.bodies.count[None]):
                 self.bodies.conclude(b, ti.cast(dt, ti.f64))
@@ -685,6 +693,14 @@ class PBDSimulator:
         order = np.argsort(kernels.id.to_numpy()[:n])
         x, v, wall = (field.to_numpy()[:n][order].astype(float) for field in (kernels.x, kernels.v, kernels.wall))
         return {"position": self._lower + x[:, :dim] * h, "velocity": v[:, :dim] * h, "density": wall[:, 3]}
+
+    def inject(self, name: str, particle: int | np.ndarray, value) -> None:
+        """Overwrite ``position`` or ``velocity`` of a particle of water, or of several, as ``state`` gives them. For studies of what happens then."""
+        kernels, h = self._kernels, self._support
+        field, content = {"position": (kernels.x, (value - self._lower) / h), "velocity": (kernels.v, np.divide(value, h))}[name]
+        whole = field.to_numpy()
+        whole[np.flatnonzero(np.isin(kernels.id.to_numpy()[: len(self._position)], particle)), : self._scene.dim] = content
+        field.from_numpy(whole)
 
     def set_velocity(self, velocity: np.ndarray) -> None:
         """Replace the velocities [n, dim] of all particles; bodies take the rigid motion nearest to theirs. For starts that no scene describes."""

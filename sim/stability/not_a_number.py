@@ -11,7 +11,7 @@ from sim.generate import generate, simulate
 from sim.scene import SceneFamily
 from sim.stability import Cell
 from sim.stability.courant import MATERIALS
-from sim.stability.driver import SPH, solver_for, way
+from sim.stability.driver import PBF, SPH, solver_for, way
 from sim.stability.refusal import FAMILY
 
 #: Frame before which a teacher goes wrong.
@@ -20,6 +20,7 @@ WHEN = 4
 STATES = {
     "water": ("position", "velocity", "velocity gradient", "stuff.J"), "sand": ("position", "velocity", "velocity gradient", "stuff.b - I"),
     "wcsph": ("position", "velocity", "density"), "dfsph": ("position", "velocity"),
+    "pbf": ("position", "velocity"),
 }  # fmt: skip
 
 
@@ -44,12 +45,12 @@ class Poisoned:
 
 
 def _family(name: str) -> SceneFamily:
-    changes = {"materials": {"stuff": (MATERIALS | SPH)[name]}, "frames": 8, "gravity": [0.0, -9.8]}
+    changes = {"materials": {"stuff": (MATERIALS | SPH | PBF)[name]}, "frames": 8, "gravity": [0.0, -9.8]}
     return SceneFamily(FAMILY | changes | way(name), "nan.yaml")
 
 
 def run() -> list[Cell]:
-    """Every field of two materials and of water by SPH, then data sets."""
+    """Every field of two materials and of water by the other methods, then data sets."""
     cells = []
     for name, fields in STATES.items():
         teacher = Poisoned()
@@ -63,7 +64,7 @@ def run() -> list[Cell]:
                 cells.append(Cell("not_a_number", f"{name}, {value:g} in its {where.removeprefix('stuff.')}", right,
                                   "failed within the frame; the frames before it are sound", trajectory.status, {},
                                   time.perf_counter() - begun))  # fmt: skip
-    for name in ("water", *SPH):
+    for name in ("water", *SPH, *PBF):
         begun = time.perf_counter()
         with tempfile.TemporaryDirectory() as place:
             try:

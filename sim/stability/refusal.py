@@ -22,24 +22,26 @@ FAMILY = {
 }
 #: Half the support radius of WCSPH, 1.25 spacings.
 H = 1.25 * 0.5 / CELLS
-#: What binds -> (materials, cfl, velocity, limit by hand [s]); of MPM, then of SPH.
+#: What binds -> (materials, cfl, velocity, limit by hand [s]); of MPM, then of the others.
 BINDING = {
     "the Courant number": ({"model": "water", "sound_speed": 20.0}, 0.4, 5.0, 0.4 / CELLS / 25.0),
     "the viscosity of stuff": ({"model": "water", "sound_speed": 5.0, "viscosity": 2000.0}, 0.4, 0.0, 1 / CELLS**2 * 1000.0 / (2 * 2 * 2000.0)),
     "a particle alone on the grid": ({"model": "water", "sound_speed": 20.0}, 2.0, 0.0, 0.8 / CELLS / (np.sqrt(2) * 20.0)),
 }
-BINDING_SPH = {
+BINDING_OTHERS = {
     ("wcsph", "the Courant number"): ({"model": "water", "sound_speed": 20.0}, 0.4, 5.0, 0.4 * 0.5 / CELLS / 25.0),
     ("wcsph", "the speed of sound"): ({"model": "water", "sound_speed": 20.0}, 2.0, 0.0, 0.5 * H / 20.0),
     ("wcsph", "the viscosity"): ({"model": "water", "sound_speed": 5.0, "viscosity": 2000.0}, 0.4, 0.0, H**2 / 25 / 2.0),
     ("dfsph", "the Courant number"): ({"model": "water"}, 0.4, 5.0, 0.4 * 0.5 / CELLS / 5.0),
+    ("pbf", "substeps 2 or the Courant number"): ({"model": "water"}, 0.4, 5.0, 0.4 * 0.5 / CELLS / 5.0),
+    ("pbf", "substeps 2"): ({"model": "water"}, 0.4, 0.0, FRAME / 2),
 }
 
 
 def run() -> list[Cell]:
     """Each limit, just above and just below; a radius in which no particle has a neighbour."""
     cells = [_radius()]
-    for (method, what), (material, cfl, speed, limit) in ({("mpm", what): given for what, given in BINDING.items()} | BINDING_SPH).items():
+    for (method, what), (material, cfl, speed, limit) in ({("mpm", what): given for what, given in BINDING.items()} | BINDING_OTHERS).items():
         begun = time.perf_counter()
         with tempfile.TemporaryDirectory() as place:
             path, out = Path(place) / "refusal.yaml", Path(place) / "out"
@@ -53,7 +55,7 @@ def run() -> list[Cell]:
 
             write(steps - 1)
             answers = [command("plan", path), command("generate", path, "--out", out)]
-            parts = (str(path), "time_step = ", f"limit {limit:.4g} s, which {what} sets")
+            parts = (str(path), "time_step = ", f"limit {limit:.4g} s, which {what}")
             refused = all(code == 2 and said.count("\n") == 1 and all(part in said for part in parts) for code, said in answers)
             left = sorted(each.name for each in Path(place).iterdir()) == ["refusal.yaml"]
             write(steps)

@@ -15,7 +15,7 @@ import yaml
 import sim.cli
 from sim.stability import Cell
 from sim.stability.courant import MATERIALS
-from sim.stability.driver import SPH
+from sim.stability.driver import PBF, SPH
 from sim.stability.refusal import FAMILY
 
 TRAJECTORIES, DEADLINE = 6, 1500.0
@@ -27,6 +27,8 @@ AMONG = {
 FAMILIES = {"": FAMILY | {"materials": {"stuff": MATERIALS["water"]}, "frames": 400, "gravity": [0.0, -9.8]}}
 FAMILIES |= {f"{name}, two bodies and an obstacle, ": FAMILY | AMONG | {"materials": {"stuff": water}, "solver": {"method": name}}
              for name, water in SPH.items()}  # fmt: skip
+FAMILIES |= {f"{name}, two bodies, ": FAMILY | AMONG | {"obstacles": [], "materials": {"stuff": water}, "solver": {"method": name}}
+             for name, water in PBF.items()}  # fmt: skip
 
 
 def run() -> list[Cell]:

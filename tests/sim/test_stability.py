@@ -14,6 +14,7 @@ from sim.errors import InputError
 from sim.generate import simulate
 from sim.mpm import solver as solver_module
 from sim.mpm.solver import MPMSimulator
+from sim.pbd.solver import PBDSimulator
 from sim.plan import plan
 from sim.scene import Scene, SceneFamily
 from sim.sph.solver import SPHSimulator
@@ -121,7 +122,7 @@ def test_a_solve_that_fails_in_silence_is_found_wrong(monkeypatch):
 
 
 def test_a_refusal_that_is_missing_is_found_wrong(monkeypatch):
-    for solver in (MPMSimulator, SPHSimulator):
+    for solver in (MPMSimulator, SPHSimulator, PBDSimulator):
         monkeypatch.setattr(solver, "check_time_step", lambda *_: None)
     monkeypatch.setattr("sim.generate.generate", lambda *_, **__: {"splits": {"train": {
         "ok": 2, "trajectories": 2, "failed": [], "cost": {"wall_seconds": 0.0, "compile_seconds": 0.0}}}})
