@@ -351,7 +351,8 @@ class _Kernels(Walls):
                 self.displace(n)
             stage = ti.min(stage + 1, 2)
         report[self.SOLVED] += ti.cast(iterations, ti.f64)
-        report[self.ERROR] = ti.max(report[self.ERROR], ti.cast(error, ti.f64))
+        # Not a maximum, which loses NaN.
+        report[self.ERROR] = ti.select(error <= report[self.ERROR], report[self.ERROR], ti.cast(error, ti.f64))
         report[self.UNSOLVED] += ti.cast(not error <= tolerance, ti.f64)
         for i in range(n):
             # The last iteration only looked.
