@@ -403,8 +403,15 @@ class CConv(nn.Module):
     # ---- simulation ----------------------------------------------------------------------------------------------------------------
 
     def begin(self, start: Start) -> None:
-        """Load the last two model frames of the start; the walls are those of its box."""
-        device = self.gravity.device
+        """Load the last two model frames of the start; the walls are its box's. Raises ``ValueError`` on a start that is not of the model's kind."""
+        spec, device = self.spec, self.gravity.device
+        if start.history.shape[2] != spec.dim or len(start.history) < self.history:
+            raise ValueError(f"the start is {list(start.history.shape)}, the model needs {self.history} frames in {spec.dim} dimensions")
+        if not math.isclose(start.frame_step, spec.frame_step, rel_tol=1e-6):
+            raise ValueError(f"the start's frame step is {start.frame_step} s, the model's {spec.frame_step} s")
+        unknown = sorted(set(np.unique(start.particle_type).tolist()) - set(spec.particle_types))
+        if unknown:
+            raise ValueError(f"particle types {unknown} are not among the model's {list(spec.particle_types)}")
         # Positions in float64: differences of float32 positions lose the last digits of small velocities, frame after frame.
         frames = start.history[len(start.history) - self.history :: self.spec.stride].astype(np.float64)
         self._state = torch.from_numpy(frames).to(device)
@@ -450,8 +457,9 @@ def load_published(path: str | Path, spacing: float = 0.05, frame_step: float = 
     """The CConv of a weights file of the original's PyTorch program (isl-org/DeepLagrangianFluids): a state dict, or one under ``model``.
 
     spacing [m], frame_step [s]: those of its data, which the file does not hold (the defaults are the published ones'). Filter size and channels
-    follow from the shapes, gravity is in the file. The box of its spec, the unit cube, means nothing: a rollout brings its own. Reads weights only
-    and runs no code; every fault of the file is an ``InputError``.
+    follow from the shapes, gravity is in the file. The box of its spec, the unit cube, means nothing: a rollout brings its own, whose walls should
+    lie 0.7 spacings from water at rest, as in its data, not half a spacing as ours do (``benchmarks/cconv.py``). Reads weights only and runs no
+    code; every fault of the file is an ``InputError``.
     """
     path = Path(path)
     content = read_content(path, "cpu", "published CConv", "copy the file again")

@@ -538,6 +538,15 @@ def test_the_box_and_the_context_of_the_start_are_seen():
     assert np.array_equal(found[0][0], found[2][0]) and not np.allclose(found[0][1], found[2][1], atol=1e-7)
 
 
+@pytest.mark.parametrize(("changes", "message"), [
+    ({"frame_step": 0.02}, "frame step is 0.02 s"), ({"particle_type": np.full(6, 6, np.int8)}, r"types \[6\]"),
+    ({"history": np.zeros((1, 6, 2), np.float32)}, "2 frames in 2"), ({"history": np.zeros((2, 6, 3), np.float32)}, "in 2 dimensions"),
+])  # fmt: skip
+def test_a_start_of_another_kind_is_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        small(2).begin(dataclasses.replace(start(falling(2)), **changes))
+
+
 def test_clumping_ends_a_rollout():
     class Inward(nn.Module):
         def forward(self, features: Tensor, pairs: Pairs, boundary: Tensor, boundary_pairs: Pairs) -> Tensor:
