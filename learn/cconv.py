@@ -68,6 +68,7 @@ class Settings(BaseModel):
     channels: tuple[PositiveInt, ...] = Field((32, 64, 64), min_length=1)  # c_0 (the second layer's input is three times as wide), c_1, ...
     kernel: int = Field(4, ge=2)  # K, cells of a filter along each axis
     radius: float = Field(2.25, gt=0)  # R in particle spacings; the paper's extent is 6 particle radii x 1.5
+    exponent: float = Field(0.5, gt=0, le=2)  # gamma of the loss |x - x_true|^gamma; the paper's lets the few particles that hit a wall count little
     unroll: tuple[PositiveInt, ...] = Field((2,), min_length=1)  # calls the loss is unrolled over, in equal shares of the training
     relaxation: Relaxation | None = None  # of rollouts: crowded particles are pushed apart after every call, see learn.relaxation
     edge_cap: float = Field(4.0, gt=1)  # a rollout fails when its pairs exceed this multiple of their first number (it clumps)
@@ -383,7 +384,7 @@ class CConv(nn.Module):
         return 2 + self.calls(progress)
 
     def loss(self, windows: Windows, generator: torch.Generator, progress: float) -> Tensor:
-        """Mean over calls and moving particles of exp(-neighbours / crowd) sqrt(|x - x_true| / s): the original's, in units of s.
+        """Mean over calls and moving particles of exp(-neighbours / crowd) (|x - x_true| / s)^gamma: the original's, in units of s.
 
         ``crowd`` is .84 of the neighbours that a full ball has. There is no noise, so nothing is drawn from ``generator``.
         """
@@ -395,7 +396,7 @@ class CConv(nn.Module):
             context = windows.context[1 + call][windows.example] if self.context else None
             predicted, neighbours = self.call(state, truth, windows.particle_type, windows.example, self.walls, context)
             square = ((predicted - truth) / self.scale).square().sum(1)
-            error = (square + SOFTENING) ** 0.25 * torch.exp(-neighbours / self.crowd)
+            error = (square + SOFTENING) ** (self.options.exponent / 2) * torch.exp(-neighbours / self.crowd)
             total = total + (error[moving] if self.kinematic else error).mean()
             state = torch.stack([state[1], predicted])
         return total / calls
