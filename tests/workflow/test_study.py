@@ -62,7 +62,7 @@ MISTAKES = [
     (put("models", "gns", "checkpoint", value="a.pt"), "give config, data and seeds"),
     (put("models", "gns", value={"checkpoint": "no.pt"}), "models.gns.checkpoint = 'no.pt': no such file"),
     (put("models", "gns", "config", value="no.yaml"), "models.gns.config = 'no.yaml': no such file"),
-    (put("models", "gns", "config", value="configs/scenes/puddle.yaml"), "model = None: must be one of gns, grid_emulator"),
+    (put("models", "gns", "config", value="configs/scenes/puddle.yaml"), "model = None: must be one of cconv, gns, grid_emulator"),
     (put("models", "gns", "data", value="pond"), "models.gns.data = 'pond': not among data: puddle"),
     (put("models", "gns", "seeds", value=[0, 0]), "models.gns.seeds"),
     (put(*COMPARISON, "data", value="pond"), "comparisons.puddle.data = 'pond': not among data: puddle"),
