@@ -43,6 +43,7 @@ from learn.checkpoint import load_weights, read_content
 from learn.dataset import DataSpec
 from learn.features import SMALLEST_STD
 from learn.graph import radius_graph
+from learn.model import check_start
 from learn.relaxation import Relaxation, relax
 from sim import periodic
 from sim.errors import InputError
@@ -405,14 +406,8 @@ class CConv(nn.Module):
 
     def begin(self, start: Start) -> None:
         """Load the last two model frames of the start; the walls are its box's. Raises ``ValueError`` on a start that is not of the model's kind."""
-        spec, device = self.spec, self.gravity.device
-        if start.history.shape[2] != spec.dim or len(start.history) < self.history:
-            raise ValueError(f"the start is {list(start.history.shape)}, the model needs {self.history} frames in {spec.dim} dimensions")
-        if not math.isclose(start.frame_step, spec.frame_step, rel_tol=1e-6):
-            raise ValueError(f"the start's frame step is {start.frame_step} s, the model's {spec.frame_step} s")
-        unknown = sorted(set(np.unique(start.particle_type).tolist()) - set(spec.particle_types))
-        if unknown:
-            raise ValueError(f"particle types {unknown} are not among the model's {list(spec.particle_types)}")
+        device = self.gravity.device
+        check_start(start, self.spec, self.history)
         # Positions in float64: differences of float32 positions lose the last digits of small velocities, frame after frame.
         frames = start.history[len(start.history) - self.history :: self.spec.stride].astype(np.float64)
         self._state = torch.from_numpy(frames).to(device)

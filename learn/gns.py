@@ -28,6 +28,7 @@ from torch.nn import functional as F
 
 from learn.features import Features, InputScaling, NoiseScheme, velocity_noise
 from learn.graph import Graph, radius_graph
+from learn.model import check_start
 from learn.relaxation import Relaxation, relax
 from sim import periodic
 from sim.simulator import SimulationError, Start
@@ -349,7 +350,10 @@ class GNS(nn.Module):
     def begin_many(self, starts: Sequence[Start]) -> None:
         """Begin from several starts in one box, to be advanced together by ``advance_many``."""
         for start in starts:
-            self._check(start)
+            check_start(start, self.spec, self.history)
+            axes = periodic.axes(start.scene)
+            if axes != self.spec.periodic:
+                raise ValueError(f"the start's box is periodic along {list(axes)}, the model's along {list(self.spec.periodic)}")
             if not np.array_equal(start.bounds, starts[0].bounds):
                 raise ValueError(f"bounds {np.asarray(start.bounds).tolist()} beside {np.asarray(starts[0].bounds).tolist()}: one box a batch")
         device = self.features.bounds.device
@@ -360,21 +364,6 @@ class GNS(nn.Module):
             frames = start.history[len(start.history) - self.history :: self.spec.stride].astype(np.float64)
             kinds = torch.from_numpy(start.particle_type.astype(np.int64)).to(device)
             self._states.append(_State(start, torch.from_numpy(frames).to(device), kinds, start.present))
-
-    def _check(self, start: Start) -> None:
-        spec = self.spec
-        if start.history.shape[2] != spec.dim:
-            raise ValueError(f"the start has {start.history.shape[2]} dimensions, the model {spec.dim}")
-        if len(start.history) < self.history:
-            raise ValueError(f"the start has {len(start.history)} frames, the model needs {self.history}")
-        if not math.isclose(start.frame_step, spec.frame_step, rel_tol=1e-6):
-            raise ValueError(f"the start's frame step is {start.frame_step} s, the model's {spec.frame_step} s")
-        axes = periodic.axes(start.scene)
-        if axes != spec.periodic:
-            raise ValueError(f"the start's box is periodic along {list(axes)}, the model's along {list(spec.periodic)}")
-        unknown = sorted(set(np.unique(start.particle_type).tolist()) - set(spec.particle_types))
-        if unknown:
-            raise ValueError(f"particle types {unknown} are not among the model's {list(spec.particle_types)}")
 
     def advance(self) -> np.ndarray:
         """The next ``stride`` frames: one prediction, and frames between. Raises ``SimulationError`` when the particles clump."""

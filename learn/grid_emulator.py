@@ -33,6 +33,7 @@ from torch.nn import functional
 
 from learn.dataset import DataSpec, Windows
 from learn.features import random_walk_noise
+from learn.model import check_start
 from learn.relaxation import Relaxation, relax
 from sim.errors import InputError
 from sim.simulator import Start
@@ -421,7 +422,8 @@ class GridEmulator(nn.Module):
     # ---- simulation -----------------------------------------------------------------------------------------------------------------
 
     def begin(self, start: Start) -> None:
-        """Load the last ``history`` model frames of the start."""
+        """Load the last ``history`` model frames of the start. Raises ``ValueError`` on a start that is not of the model's kind."""
+        check_start(start, self.spec, self.history)
         device = self.bounds.device
         known = np.ascontiguousarray(start.history[-self.history :: self.spec.stride], np.float32)
         self._state = torch.from_numpy(known).to(device)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from importlib import import_module
 from typing import TYPE_CHECKING, ClassVar, Protocol
 
@@ -40,6 +41,19 @@ class LearnedModel(Protocol):
     def begin(self, start: Start) -> None: ...
 
     def advance(self) -> np.ndarray: ...
+
+
+def check_start(start: Start, spec: DataSpec, history: int) -> None:
+    """Raises ``ValueError`` on a start that a model of data ``spec`` cannot begin from; history: (unstrided) frames that it needs."""
+    if start.history.shape[2] != spec.dim:
+        raise ValueError(f"the start has {start.history.shape[2]} dimensions, the model {spec.dim}")
+    if len(start.history) < history:
+        raise ValueError(f"the start has {len(start.history)} frames, the model needs {history}")
+    if not math.isclose(start.frame_step, spec.frame_step, rel_tol=1e-6):
+        raise ValueError(f"the start's frame step is {start.frame_step} s, the model's {spec.frame_step} s")
+    unknown = sorted(set(np.unique(start.particle_type).tolist()) - set(spec.particle_types))
+    if unknown:
+        raise ValueError(f"particle types {unknown} are not among the model's {list(spec.particle_types)}")
 
 
 #: name -> module and class, imported when built.

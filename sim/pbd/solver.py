@@ -541,12 +541,13 @@ class PBDSimulator:
         numbers[3, :dim], numbers[3, 4 : 4 + dim] = cells + 2, cells / width
         return numbers
 
-    def _longest(self, scene: Scene, speed: float) -> float:
-        """Step [s] at a speed of particles [m/s]: ``substeps`` a frame at least, and |v| dt + |g| dt^2 <= cfl spacing."""
+    def limits(self, scene: Scene, speed: float) -> dict[str, float]:
+        """Bounds on the time step [s] at a speed of particles [m/s], by what sets them: ``substeps`` a frame at least, and |v| dt + |g| dt^2 <= cfl
+        spacing."""
         gravity = float(np.linalg.norm(np.array(scene.gravity) - scene.acceleration(), axis=-1).max())
         way = (self.settings["cfl"] or scene.cfl) * self._layout(scene)[0]
-        limit = 2 * way / max(speed + np.sqrt(speed**2 + 4 * gravity * way), np.finfo(float).tiny)
-        return min(limit, scene.frame_step / scene.solver.substeps)
+        courant = 2 * way / max(speed + np.sqrt(speed**2 + 4 * gravity * way), np.finfo(float).tiny)
+        return {"the Courant number": courant, f"substeps {scene.solver.substeps}": scene.frame_step / scene.solver.substeps}
 
     def _fixed(self, scene: Scene) -> float | None:
         return None if self.settings["cfl"] else scene.time_step
@@ -555,10 +556,12 @@ class PBDSimulator:
         """Refuse a fixed time step in which, at the bodies' own speeds, particles would pass more than a share ``cfl`` of their spacing. Raises
         ``InputError``."""
         step, speed = self._fixed(scene), max(float(np.linalg.norm(body.velocity)) for body in scene.bodies)
-        if step is not None and step > (longest := self._longest(scene, speed)) * (1 + 1e-6):
-            steps = int(np.ceil(scene.frame_step / longest))
-            remedy = (f"above the limit {longest:.4g} s, which substeps {scene.solver.substeps} or the Courant number sets (cfl {scene.cfl:g}, speed "
-                      f"{speed:.3g} m/s); use at most {scene.frame_step / steps:.8g}, {steps} steps a frame, or leave it out: adaptive")
+        limits = self.limits(scene, speed)
+        what = min(limits, key=limits.get)
+        if step is not None and step > limits[what] * (1 + 1e-6):
+            steps = int(np.ceil(scene.frame_step / limits[what]))
+            remedy = (f"above the limit {limits[what]:.4g} s, which {what} sets (cfl {scene.cfl:g}, speed {speed:.3g} m/s); use at most "
+                      f"{scene.frame_step / steps:.8g}, {steps} steps a frame, or leave it out: adaptive")
             raise InputError(where, "time_step", scene.time_step, remedy)
 
     def plan(self, scene: Scene) -> dict:
@@ -584,7 +587,7 @@ class PBDSimulator:
         gravity = float(np.linalg.norm(np.array(scene.gravity) - scene.acceleration(), axis=1).max())
         start = float(np.sqrt((particles.velocity**2).sum(1).max()))
         fall = float(np.sqrt(start**2 + 2 * gravity * np.linalg.norm(np.ptp(scene.bounds, axis=1))))
-        steps = [self._fixed(scene) or self._longest(scene, speed) for speed in (0.0, fall)]
+        steps = [self._fixed(scene) or min(self.limits(scene, speed).values()) for speed in (0.0, fall)]
         return {
             "title": "position-based dynamics", "dim": dim, "rates": ["pbf"], "materials": [each.model for each in scene.materials.values()],
             "walls": "slip", "obstacles": 0, "context": 0 if context is None else context.shape[1],

@@ -33,7 +33,7 @@ BINDING_OTHERS = {
     ("wcsph", "the speed of sound"): ({"model": "water", "sound_speed": 20.0}, 2.0, 0.0, 0.5 * H / 20.0),
     ("wcsph", "the viscosity"): ({"model": "water", "sound_speed": 5.0, "viscosity": 2000.0}, 0.4, 0.0, H**2 / 25 / 2.0),
     ("dfsph", "the Courant number"): ({"model": "water"}, 0.4, 5.0, 0.4 * 0.5 / CELLS / 5.0),
-    ("pbf", "substeps 2 or the Courant number"): ({"model": "water"}, 0.4, 5.0, 0.4 * 0.5 / CELLS / 5.0),
+    ("pbf", "the Courant number"): ({"model": "water"}, 0.4, 5.0, 0.4 * 0.5 / CELLS / 5.0),
     ("pbf", "substeps 2"): ({"model": "water"}, 0.4, 0.0, FRAME / 2),
 }
 
@@ -55,7 +55,7 @@ def run() -> list[Cell]:
 
             write(steps - 1)
             answers = [command("plan", path), command("generate", path, "--out", out)]
-            parts = (str(path), "time_step = ", f"limit {limit:.4g} s, which {what}")
+            parts = (str(path), "time_step = ", f"limit {limit:.4g} s, which {what} sets")
             refused = all(code == 2 and said.count("\n") == 1 and all(part in said for part in parts) for code, said in answers)
             left = sorted(each.name for each in Path(place).iterdir()) == ["refusal.yaml"]
             write(steps)

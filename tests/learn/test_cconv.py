@@ -541,7 +541,8 @@ def test_the_box_and_the_context_of_the_start_are_seen():
 
 @pytest.mark.parametrize(("changes", "message"), [
     ({"frame_step": 0.02}, "frame step is 0.02 s"), ({"particle_type": np.full(6, 6, np.int8)}, r"types \[6\]"),
-    ({"history": np.zeros((1, 6, 2), np.float32)}, "2 frames in 2"), ({"history": np.zeros((2, 6, 3), np.float32)}, "in 2 dimensions"),
+    ({"history": np.zeros((1, 6, 2), np.float32)}, "1 frames, the model needs 2"),
+    ({"history": np.zeros((2, 6, 3), np.float32)}, "3 dimensions, the model 2"),
 ])  # fmt: skip
 def test_a_start_of_another_kind_is_refused(changes, message):
     with pytest.raises(ValueError, match=message):

@@ -243,6 +243,16 @@ def test_gradients_reach_every_weight_and_repeat_bitwise() -> None:
     assert all(torch.equal(one, other) for one, other in zip(*found, strict=True))
 
 
+@pytest.mark.parametrize(("changes", "message"), [
+    ({"frame_step": 0.5}, "frame step is 0.5 s"), ({"particle_type": np.full(4, 6, np.int8)}, r"types \[6\]"),
+    ({"history": np.zeros((1, 4, 2), np.float32)}, "1 frames, the model needs 2"),
+    ({"history": np.zeros((2, 4, 3), np.float32)}, "3 dimensions, the model 2"),
+])  # fmt: skip
+def test_a_start_of_another_kind_is_refused(changes: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        emulator().begin(start(flight(4, 2), **changes))
+
+
 def test_stride_interpolates_between_model_frames() -> None:
     model = emulator({"history": 2}, stride=3, gravity=(0.0, 0.0))
     assert model.history == 4

@@ -103,10 +103,12 @@ def test_a_finished_run_is_not_repeated(unbroken: Path, bounce_dataset: Path) ->
     assert {path.name: path.read_bytes() for path in unbroken.iterdir()} == before
 
 
-CHILD = """
-import sys, time
+#: What a child process of a test begins with: the dummy model, slowed down so that a kill hits it in its work.
+SLOW = """
+import os, random, signal, sys, time
 sys.path[:0] = [{here!r}, {root!r}]
 import dummy_model, torch
+torch.set_num_threads(1)
 from learn.model import MODELS
 MODELS["dummy"] = ("dummy_model", "Dummy")
 from learn.train import Config, Trainer
@@ -115,6 +117,9 @@ def slow(self, *arguments):
     time.sleep(0.005)
     return plain(self, *arguments)
 dummy_model.Dummy.loss = slow
+"""
+
+CHILD = SLOW + """
 Trainer(Config.model_validate_json({config!r}), {data!r}, {run!r}).run()
 """
 
@@ -145,19 +150,7 @@ def test_killed_and_resumed_is_bitwise_unbroken(unbroken: Path, bounce_dataset: 
     assert_same_run(run, unbroken)
 
 
-FORKS = """
-import os, random, signal, sys, time
-sys.path[:0] = [{here!r}, {root!r}]
-import dummy_model, torch
-torch.set_num_threads(1)
-from learn.model import MODELS
-MODELS["dummy"] = ("dummy_model", "Dummy")
-from learn.train import Config, Trainer
-plain = dummy_model.Dummy.loss
-def slow(self, *arguments):
-    time.sleep(0.005)
-    return plain(self, *arguments)
-dummy_model.Dummy.loss = slow
+FORKS = SLOW + """
 instants = random.Random({seed})
 killed = 0
 while killed < {kills}:
