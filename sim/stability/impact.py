@@ -41,9 +41,7 @@ def _thrown(name: str, material: dict, target: str, dim: int, more: str = "", ma
     if dim == 3:
         what = deep(what, 0.375, 0.625)
     run = follow(what, 60)
-    if name in PBF:
-        rest = what.frame_step / solver_for(what).plan(what)["substeps_per_frame"][0]
-    elif name in SPH:
+    if name in SPH | PBF:
         rest = min(solver_for(what).limits(what, G * what.frame_step).values())
     else:
         rest = 0.4 / CELLS / (float(solver_for(what).plan(what)["wave_speed"]) + G * what.frame_step)
