@@ -36,8 +36,8 @@ from learn.checkpoint import build_model, load_weights, read_content, validate, 
 from learn.dataset import DataSpec
 from learn.features import SMALLEST_STD, TYPE_SLOTS, TYPE_WIDTH
 from learn.gns import GNS
-from sim.errors import InputError
-from sim.trajectory import write_json
+from sim.errors import InputError, RunError
+from sim.trajectory import atomic_folder, vacant, write_json
 
 #: ``--noise_std`` of the port's ``train.py`` when it is not given [length / frame].
 NOISE_STD = 6.7e-4
@@ -137,11 +137,10 @@ def export_model(model: GNS, out: str | Path) -> dict:
     """Write ``model-0.pt`` and ``metadata.json`` into the new folder ``out``, as the port reads them, and return the metadata.
 
     These hold, beside what the port reads, what ``import_model`` needs and the sizes that ``train.py`` fixes (``latent_dim`` and so on, by the
-    names of the port's ``LearnedSimulator``). Raises ``InputError`` for a model that the port cannot be.
+    names of the port's ``LearnedSimulator``). Complete or absent. Raises ``InputError`` for a model that the port cannot be, ``RunError`` where
+    nothing can be written.
     """
-    out = Path(out)
-    if out.exists():
-        raise InputError(out, "out", str(out), "exists; give a new folder")
+    out = vacant(out)
     if not isinstance(model, GNS):
         raise InputError("model", "name", model.name, "only a gns can go to geoelements/gns")
     spec, options = model.spec, model.options
@@ -166,8 +165,12 @@ def export_model(model: GNS, out: str | Path) -> dict:
         "noise_std": model.sigma, "edges": "updated" if options.edge_update else "doubled", "spacing": spec.spacing, "gravity": spec.gravity,
         "particle_types": spec.particle_types,
     }
-    write_json(out / "metadata.json", metadata)
-    write_content(out / "model-0.pt", weights)
+    try:
+        with atomic_folder(out) as folder:
+            write_json(folder / "metadata.json", metadata)
+            write_content(folder / "model-0.pt", weights)
+    except OSError as error:
+        raise RunError(f"{out}: cannot be written: {error.strerror or error}") from None
     return metadata
 
 

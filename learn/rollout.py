@@ -141,11 +141,14 @@ def _write(
             results = rollouts(model, [start_from(one, known) for one in trajectories], [_wanted(one, known, frames) for one in trajectories])
         for (index, trajectory), result in zip(some, results, strict=True):
             predicted[index], costs[f"{index:06d}"] = _predicted(trajectory, known, result, simulator)
-    write_shard(out, predicted)
     total = sum(cost["seconds"] for cost in costs.values())
     failed = {f"{index:06d}": trajectory.status for index, trajectory in predicted.items() if not trajectory.ok}
     content = {"wall_seconds": total, "device": str(device), "threads": threads, "failed": failed, "trajectories": costs}
-    write_json(out.with_name(out.name + ".cost.json"), content)
+    try:
+        write_shard(out, predicted)
+        write_json(out.with_name(out.name + ".cost.json"), content)
+    except OSError as error:
+        raise RunError(f"{out}: cannot be written: {error.strerror or error}") from None
     if len(failed) == len(predicted):
         raise RunError(f"{out}: all {len(failed)} rollouts failed: {next(iter(failed.values()))}")
     return content

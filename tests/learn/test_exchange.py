@@ -1,5 +1,6 @@
 """Exchange with the PyTorch port geoelements/gns: equal outputs in both directions, and what cannot be exchanged."""
 
+import errno
 import json
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from learn.exchange import export_model, import_model
 from learn.gns import GNS
 from learn.graph import radius_graph
 from learn.model import build
-from sim.errors import InputError
+from sim.errors import InputError, RunError
 
 torch.set_num_threads(1)
 
@@ -214,3 +215,19 @@ def test_only_a_gns_goes_to_the_port(tmp_path, capsys):
     save_model(tmp_path / "grid.pt", build("grid_emulator", {"channels": [8, 8]}, spec(velocity_std=(1e-2, 1e-2))))
     assert main(["export-model", str(tmp_path / "grid.pt"), "--out", str(tmp_path / "out")]) == 2
     assert "only a gns" in capsys.readouterr().err
+
+
+def test_an_export_is_complete_or_absent(tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    model = build("gns", {"latent": 8, "message_passing": 1}, spec())
+    with monkeypatch.context() as patch:
+        patch.setattr("learn.exchange.write_content", full)
+        with pytest.raises(RunError, match="out: cannot be written: No space left"):
+            export_model(model, tmp_path / "out")
+    assert list(tmp_path.iterdir()) == []
+    export_model(model, tmp_path / "out")
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["metadata.json", "model-0.pt"]
+    with pytest.raises(InputError, match="exists already"):
+        export_model(model, tmp_path / "out")

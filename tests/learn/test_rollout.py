@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import errno
 import json
 from pathlib import Path
 
@@ -63,6 +64,16 @@ def test_mistakes_of_a_rollout_from_a_scene(tmp_path: Path, dummy: Path, bounce_
         error = capsys.readouterr().err
         assert said in error and error.startswith("sluice-learn: ") and len(error.splitlines()) == 1
     assert not (tmp_path / "out.h5").exists()
+
+
+def test_a_full_disk_is_named(dummy: Path, bounce_dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("learn.rollout.write_shard", full)
+    out = tmp_path / "out.h5"
+    assert main(["rollout", str(dummy), "--data", str(bounce_dataset), "--out", str(out)]) == 1
+    assert capsys.readouterr().err == f"sluice-learn: {out}: cannot be written: No space left on device\n"
 
 
 def test_a_rollout_goes_on_beyond_the_truth(dummy: Path, bounce_dataset: Path, tmp_path: Path) -> None:
