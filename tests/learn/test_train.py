@@ -421,9 +421,12 @@ def test_bad_configurations(tmp_path: Path, bounce_dataset: Path, content: objec
 @pytest.mark.parametrize(("content", "key"), [
     ({**GOOD, "model": "gsn"}, "model = 'gsn'"), ({**GOOD, "settings": {"nose": 1}}, "nose"), ({**GOOD, "settings": {"noise": -1}}, "noise"),
     ({**GOOD, "data": {"stride": 30}}, "stride"), ({**GOOD, "training": {"steps": 5, "batch": 10**6}}, "batch"),
-    ({**GOOD, "data": {"skip_rest": 1e9}}, "skip_rest"),
+    ({**GOOD, "data": {"skip_rest": 1e9}}, "skip_rest"), ({**GOOD, "training": {"steps": 5, "tensorboard": True}}, "tensorboard is missing"),
 ])
-def test_configurations_that_do_not_fit(tmp_path: Path, bounce_dataset: Path, content: dict, key: str, capsys: pytest.CaptureFixture) -> None:
+def test_configurations_that_do_not_fit(
+    tmp_path: Path, bounce_dataset: Path, content: dict, key: str, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(training, "find_spec", lambda name: None)
     path = write(tmp_path / "c.yaml", content)
     assert main(["train", str(path), "--data", str(bounce_dataset), "--out", str(tmp_path / "run")]) == 2
     error = capsys.readouterr().err
