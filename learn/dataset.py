@@ -147,6 +147,7 @@ class Windows:
     example: torch.Tensor
     context: torch.Tensor | None = None
     place: tuple[int, int] | None = None
+    counted: torch.Tensor | None = None
 
     @property
     def examples(self) -> int:

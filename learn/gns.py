@@ -36,6 +36,7 @@ from sim.trajectory import KINEMATIC_TYPE
 
 if TYPE_CHECKING:
     from learn.dataset import DataSpec, Windows
+    from learn.fused import PaddedGraph, Search, Shadow
 
 #: Added to the variance by every LayerNorm (torch's default).
 NORM_EPSILON = 1e-5
@@ -247,9 +248,14 @@ class Network(nn.Module):
         self.processor = nn.ModuleList(Interaction(latent, hidden, settings.edge_update) for _ in range(settings.message_passing // self.repeats))
         self.decode = MLP(latent, latent, hidden, dim, norm=False)
         self.low_precision = settings.precision == "bf16"
+        self.shadow: Shadow | None = None  # what fused kernels read
 
-    def forward(self, nodes: Tensor, edges: Tensor, graph: Graph) -> Tensor:
+    def forward(self, nodes: Tensor, edges: Tensor, graph: Graph | PaddedGraph) -> Tensor:
         """nodes [particles, node_width], edges [edges, edge_width] -> [particles, dim]."""
+        if not isinstance(graph, Graph):
+            from learn import fused  # not above: Triton comes with CUDA builds of torch alone
+
+            return fused.forward(self, nodes, edges, graph)
         dtype = torch.bfloat16 if self.low_precision else nodes.dtype
         nodes = self.encode_node(nodes, dtype)
         if isinstance(self.encode_edge, nn.Parameter):
@@ -264,13 +270,28 @@ class Network(nn.Module):
 
 @dataclass
 class _State:
-    """A rollout: positions [C + 1, particles, dim] float64, types, the frame it is at, edges of its first graph."""
+    """A rollout: positions [C + 1, particles, dim] float64, types, indices of kinematic particles (None: there are none), gravity [length / model
+    frame^2], the frame it is at, edges of its first graph."""
 
     start: Start
     position: Tensor
     kinds: Tensor
+    fixed: Tensor | None
+    gravity: Tensor
     present: int
     first_edges: int | None = None
+
+    @property
+    def context(self) -> np.ndarray:
+        """[c]: of the present frame."""
+        return self.start.context[min(self.present, len(self.start.context) - 1)]
+
+    def known(self, stride: int) -> Tensor | None:
+        """[stride, k, dim]: where the kinematic particles are in the next frames."""
+        if self.fixed is None:
+            return None
+        places = self.start.kinematic[np.minimum(self.present + 1 + np.arange(stride), len(self.start.kinematic) - 1)]
+        return torch.as_tensor(places, dtype=self.position.dtype, device=self.position.device)
 
 
 class GNS(nn.Module):
@@ -294,6 +315,21 @@ class GNS(nn.Module):
             absolute=settings.encoder == "absolute", relative_velocity=settings.relative_velocity, ballistic=settings.ballistic, walls=settings.walls,
         )
         self.network = Network(settings, self.features.node_width, self.features.edge_width, spec.dim)
+        self.search: Search | None = None  # of graphs on the device, where steps are replayed
+
+    def _graph(self, position: Tensor, example: Tensor | None, period: np.ndarray | None, present: Tensor | None = None) -> Graph | PaddedGraph:
+        if self.search is not None:
+            return self.search(position, example, present)
+        return radius_graph(position, self.radius, example, self.options.self_edges, period)
+
+    @property
+    def replayable(self) -> bool:
+        """Whether steps of this model can be CUDA graphs of fused kernels (``learn.fused``, ``learn.replay``): in bf16, in a box with walls."""
+        if self.features.bounds.device.type != "cuda" or not self.network.low_precision or self.spec.periodic:
+            return False
+        from learn import fused
+
+        return fused.supports(self.network)
 
     def calls(self, progress: float) -> int:
         """Model calls the loss is unrolled over at this share of the training."""
@@ -311,22 +347,32 @@ class GNS(nn.Module):
         position: error / (acceleration std * j (j + 1) / 2), the number of times an acceleration error has entered it by then; the
         mean over the calls is returned, which for one call is the paper's loss.
         """
-        given = self.velocities + 1
+        return self.loss_under(self.noise(windows, generator), windows)
+
+    def noise(self, windows: Windows, generator: torch.Generator) -> Tensor:
+        """[C + 1, particles, dim]: of the positions a model is given, as ``loss`` draws it."""
         moving = self.features.moving(windows.particle_type)
-        noise = velocity_noise(self.options.noise_scheme, windows.position[:given], self.sigma, generator, moving, windows.place)
+        return velocity_noise(self.options.noise_scheme, windows.position[: self.velocities + 1], self.sigma, generator, moving, windows.place)
+
+    def loss_under(self, noise: Tensor, windows: Windows) -> Tensor:
+        """``loss`` with this noise."""
+        given = self.velocities + 1
+        moving, counted = self.features.moving(windows.particle_type), windows.counted
+        judged = moving if counted is None else counted if moving is None else moving & counted
+        present = None if counted is None else counted.sum(dtype=torch.int32).view(1)
         position = windows.position[:given] + noise
         total = position.new_zeros(())
         calls = len(windows.position) - given
         for call in range(1, calls + 1):
             context = windows.context[given + call - 2][windows.example] if self.features.context else None
-            graph = radius_graph(position[-1], self.radius, windows.example, self.options.self_edges, self.features.period)
+            graph = self._graph(position[-1], windows.example, self.features.period, present)
             output = self._predict(position, graph, windows.particle_type, self.features.bounds, context, self.features.period)
             following = windows.position[given + call - 1] + noise[-1]
             error = (output - self.features.target(position, following)) / (call * (call + 1) / 2)
             square = error.square().sum(1)
             if self.options.huber is not None:
                 square = 2 * self.options.huber**2 * ((1 + square / self.options.huber**2).sqrt() - 1)
-            total = total + (square if moving is None else square[moving]).mean()
+            total = total + (square.mean() if judged is None else torch.where(judged, square, 0).sum() / judged.sum())
             if call < calls:
                 predicted = 2 * position[-1] - position[-2] + self.features.acceleration(output, position, self.features.bounds)
                 if moving is not None:
@@ -335,7 +381,8 @@ class GNS(nn.Module):
         return total / calls
 
     def _predict(
-        self, position: Tensor, graph: Graph, particle_type: Tensor, bounds: Tensor, context: Tensor | None, period: np.ndarray | None = None
+        self, position: Tensor, graph: Graph | PaddedGraph, particle_type: Tensor, bounds: Tensor, context: Tensor | None,
+        period: np.ndarray | None = None,
     ) -> Tensor:
         output = self.network(self.features.nodes(position, particle_type, bounds, context), self.features.edges(position, graph, period), graph)
         if self.options.flight_below:
@@ -358,12 +405,14 @@ class GNS(nn.Module):
                 raise ValueError(f"bounds {np.asarray(start.bounds).tolist()} beside {np.asarray(starts[0].bounds).tolist()}: one box a batch")
         device = self.features.bounds.device
         self._bounds = torch.as_tensor(starts[0].walls, device=device)
-        self._states = []
+        self._states, self._replay = [], None
         for start in starts:
             # Positions in float64: differences of float32 positions lose the last digits of small accelerations, frame after frame.
             frames = start.history[len(start.history) - self.history :: self.spec.stride].astype(np.float64)
             kinds = torch.from_numpy(start.particle_type.astype(np.int64)).to(device)
-            self._states.append(_State(start, torch.from_numpy(frames).to(device), kinds, start.present))
+            fixed = None if start.kinematic is None else torch.from_numpy(np.flatnonzero(start.particle_type == KINEMATIC_TYPE)).to(device)
+            gravity = torch.as_tensor(start.gravity * (start.frame_step * self.spec.stride) ** 2, dtype=torch.float64, device=device)
+            self._states.append(_State(start, torch.from_numpy(frames).to(device), kinds, fixed, gravity, start.present))
 
     def advance(self) -> np.ndarray:
         """The next ``stride`` frames: one prediction, and frames between. Raises ``SimulationError`` when the particles clump."""
@@ -375,6 +424,8 @@ class GNS(nn.Module):
     @torch.inference_mode()
     def advance_many(self, which: Sequence[int]) -> list[np.ndarray | SimulationError]:
         """``advance`` of these starts, as one graph: frames, or why there are none."""
+        if self.replayable and self.options.relaxation is None:
+            return self._replayed(list(which))
         states = [self._states[number] for number in which]
         counts = [state.position.shape[1] for state in states]
         position = torch.cat([state.position for state in states], 1)
@@ -383,18 +434,12 @@ class GNS(nn.Module):
             example = torch.repeat_interleave(torch.tensor(counts))
         context = None
         if self.features.context:
-            rows = [state.start.context[min(state.present, len(state.start.context) - 1)] for state in states]
-            context = torch.as_tensor(np.repeat(np.stack(rows), counts, axis=0), device=position.device)
+            context = torch.as_tensor(np.repeat(np.stack([state.context for state in states]), counts, axis=0), device=position.device)
         period = states[0].start.period
         graph = radius_graph(position[-1], self.radius, example, self.options.self_edges, period)
         ends = np.cumsum([0, *counts])
         edges = graph.offsets[torch.from_numpy(ends)].diff().tolist()
-        failed: dict[int, SimulationError] = {}
-        for number, state, own, count in zip(which, states, edges, counts, strict=True):
-            state.first_edges = state.first_edges or max(own, count)  # without self edges there may be none at first
-            if own > self.options.edge_cap * state.first_edges:
-                cap = f"{self.options.edge_cap:g} x the {state.first_edges} of the start"
-                failed[number] = SimulationError(f"particles clump: {own} edges, {cap} exceeded")
+        failed = self._clumped(which, edges)
         if failed:
             # Without what has clumped: its edges may be too many to go through.
             others = [number for number in which if number not in failed]
@@ -404,29 +449,59 @@ class GNS(nn.Module):
         acceleration = self.features.acceleration(output, position, self._bounds)
         return [self._follow(state, acceleration[first:last]) for state, first, last in zip(states, ends[:-1], ends[1:], strict=True)]
 
-    def _follow(self, state: _State, acceleration: Tensor) -> np.ndarray:
-        """The frames up to the one that an acceleration leads to.
+    def _clumped(self, which: Sequence[int], edges: Sequence[int]) -> dict[int, SimulationError]:
+        """What has more edges than it may; the first numbers of edges set the measure."""
+        failed = {}
+        for number, own in zip(which, edges, strict=True):
+            state = self._states[number]
+            state.first_edges = state.first_edges or max(own, len(state.kinds))  # without self edges there may be none at first
+            if own > self.options.edge_cap * state.first_edges:
+                cap = f"{self.options.edge_cap:g} x the {state.first_edges} of the start"
+                failed[number] = SimulationError(f"particles clump: {own} edges, {cap} exceeded")
+        return failed
 
-        Between, x(s) = x0 + s (x1 - x0) - s (1 - s) a / 2 with the predicted acceleration a kept between 0 and gravity: exact in free
+    def _replayed(self, which: list[int]) -> list[np.ndarray | SimulationError]:
+        from learn.replay import RolloutReplay
+
+        if self._replay is None or self._replay.which != which:
+            if self._replay is not None:
+                self._replay.release()
+            self._replay = RolloutReplay(self, which, self._states, self._bounds)
+        frames, edges = self._replay.compute()
+        failed = self._clumped(which, edges)
+        if failed:
+            others = [number for number in which if number not in failed]
+            found = dict(zip(others, self._replayed(others), strict=True)) if others else {}
+            return [failed[number] if number in failed else found[number] for number in which]
+        self._replay.accept()
+        return frames
+
+    def _follow(self, state: _State, acceleration: Tensor) -> np.ndarray:
+        """The frames up to the one that an acceleration leads to."""
+        start, known = state.start, state.known(self.spec.stride)
+        following = self.following(state, state.position, acceleration, known)
+        if self.options.relaxation is not None:
+            fixed = None if state.fixed is None else (state.kinds == KINEMATIC_TYPE).cpu().numpy()
+            relaxed = relax(following.cpu().numpy(), start.bounds, self.spec.spacing, self.options.relaxation, fixed, start.period)
+            following = torch.from_numpy(relaxed).to(following.device)
+        frames = self.between(state, state.position, acceleration, following, known)
+        state.position = torch.cat([state.position[1:], frames[-1:]])
+        state.present += self.spec.stride
+        return periodic.wrapped(frames.cpu().numpy(), start.bounds, start.period).astype(np.float32)
+
+    def following(self, state: _State, position: Tensor, acceleration: Tensor, known: Tensor | None) -> Tensor:
+        """[particles, dim]: position [C + 1, particles, dim] one call on; known [stride, k, dim]: kinematic particles' positions until then."""
+        following = 2 * position[-1] - position[-2] + acceleration
+        return following if known is None else following.index_copy(0, state.fixed, known[-1])
+
+    def between(self, state: _State, position: Tensor, acceleration: Tensor, following: Tensor, known: Tensor | None) -> Tensor:
+        """[stride, particles, dim]: the frames up to ``following``.
+
+        x(s) = x0 + s (x1 - x0) - s (1 - s) a / 2 with the predicted acceleration a kept between 0 and gravity: exact in free
         flight, straight through an impact, which a parabola would carry into the wall.
         """
-        start, stride, last = state.start, self.spec.stride, state.position[-1]
-        following = 2 * last - state.position[-2] + acceleration
-        known = None
-        if start.kinematic is not None:
-            known = start.kinematic[np.minimum(state.present + 1 + np.arange(stride), len(start.kinematic) - 1)]
-            known = torch.as_tensor(known, dtype=last.dtype, device=last.device)
-            following[state.kinds == KINEMATIC_TYPE] = known[-1]
-        if self.options.relaxation is not None:
-            fixed = None if known is None else (state.kinds == KINEMATIC_TYPE).cpu().numpy()
-            relaxed = relax(following.cpu().numpy(), start.bounds, self.spec.spacing, self.options.relaxation, fixed, start.period)
-            following = torch.from_numpy(relaxed).to(last.device)
-        gravity = torch.as_tensor(start.gravity * (start.frame_step * stride) ** 2, dtype=last.dtype, device=last.device)
-        fall = acceleration.to(last.dtype).clamp(gravity.clamp(max=0), gravity.clamp(min=0))
+        stride, last = self.spec.stride, position[-1]
+        fall = acceleration.to(last.dtype).clamp(state.gravity.clamp(max=0), state.gravity.clamp(min=0))
         share = torch.arange(1, stride + 1, dtype=last.dtype, device=last.device)[:, None, None] / stride
         frames = last + share * (following - last) - share * (1 - share) / 2 * fall
-        if known is not None:
-            frames[:, state.kinds == KINEMATIC_TYPE] = known
-        state.position = torch.cat([state.position[1:], frames[-1:]])
-        state.present += stride
-        return periodic.wrapped(frames.cpu().numpy(), start.bounds, start.period).astype(np.float32)
+        return frames if known is None else frames.index_copy(1, state.fixed, known)

@@ -23,7 +23,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal, NoReturn
 
 import numpy as np
 import torch
@@ -42,6 +42,9 @@ from sim import __version__, periodic
 from sim.errors import InputError, RunError
 from sim.simulator import rollout, start_from
 from sim.trajectory import KINEMATIC_TYPE, Trajectory, write_json, write_text
+
+if TYPE_CHECKING:
+    from learn.replay import TrainingReplay
 
 LOG_COLUMNS = ("step", "seconds", "loss", "learning_rate", "gradient_norm", "window")
 VALIDATION_COLUMNS = ("step", "seconds", "rollout_mse", "spacing_ratio", "finished", "best")
@@ -157,13 +160,13 @@ class Adam:
         self.steps = [torch.zeros((), device=parameter.device) for parameter in parameters]
 
     @torch.no_grad()
-    def step(self, rate: float) -> None:
-        """One step at learning rate ``rate``; parameters without a gradient stay."""
+    def step(self, rate: float | Tensor, found_inf: Tensor | None = None) -> None:
+        """One step at learning rate ``rate``; parameters without a gradient stay, and all where ``found_inf`` [] is 1."""
         used = [k for k, parameter in enumerate(self.parameters) if parameter.grad is not None]
         lists = (self.parameters, [parameter.grad for parameter in self.parameters], self.mean, self.square)
         weights, gradients, mean, square = ([entries[k] for k in used] for entries in lists)
         adam(
-            weights, gradients, mean, square, [], [self.steps[k] for k in used], fused=True, amsgrad=False, maximize=False,
+            weights, gradients, mean, square, [], [self.steps[k] for k in used], fused=True, found_inf=found_inf, amsgrad=False, maximize=False,
             beta1=0.9, beta2=0.999, eps=1e-8, lr=rate, weight_decay=self.weight_decay, decoupled_weight_decay=True,
         )
 
@@ -307,6 +310,9 @@ class Trainer:
         self._seconds_before = self.progress_state["seconds"]
         self._stop: str | None = None
         self._rolling = False
+        alone = self.processes.size == 1 and self.settings.edges is None and self.settings.optimizer == "adam"
+        self.replayed = alone and getattr(self.model, "replayable", False)
+        self._replay: TrainingReplay | None = None
 
     # -- set-up --------------------------------------------------------------------------------------------------------------
 
@@ -463,8 +469,29 @@ class Trainer:
 
     def _train_step(self, progress: float) -> None:
         state, frames = self.progress_state, self.model.window(progress)
-        windows = self.sampler.next(frames).to(self.device)
+        windows = self.sampler.next(frames)
         rate = self.settings.rate(self.step, progress)
+        state["logged"] += 1
+        if self.replayed:
+            if self._replay is None or self._replay.frames != frames:
+                self._settle()
+                self._replay = self._replay_of(windows)
+            self._replay.step(windows, self.generator, rate, self._decay())
+        else:
+            self._step(windows.to(self.device), rate, progress)
+        state["step"] += 1
+        if self.processes.leads and self.step % self.settings.log_every == 0:
+            self._settle()
+            count = max(state["logged"], 1)
+            mean = state["loss_sum"] / count
+            if self.board:
+                self.board.add_scalar("loss", mean, self.step)
+                self.board.add_scalar("learning rate", rate, self.step)
+            self.log.add(self.step, f"{self.seconds():.3f}", repr(mean), repr(rate), repr(state["norm_sum"] / count), frames)
+            state["loss_sum"], state["norm_sum"], state["logged"] = 0.0, 0.0, 0
+            self._show(mean, rate)
+
+    def _step(self, windows: Windows, rate: float, progress: float) -> None:
         loss = self.model.loss(windows, self.generator, progress)
         for parameter in self.parameters:
             parameter.grad = None
@@ -473,26 +500,38 @@ class Trainer:
         norm = torch.nn.utils.clip_grad_norm_(self.parameters, self.settings.gradient_clip or math.inf)
         norm_value = float(norm)
         if not (math.isfinite(loss_value) and math.isfinite(norm_value)):
-            kept = "checkpoint.pt keeps good weights" if (self.folder / "checkpoint.pt").is_file() else "no checkpoint was written yet"
-            raise RunError(
-                f"{self.folder}: step {self.step}: loss = {loss_value}, gradient norm = {norm_value}: training diverged; {kept}; "
-                f"start again with a smaller training.learning_rate (now {self.settings.learning_rate:g})"
-            )
+            self._diverged(f"loss = {loss_value}, gradient norm = {norm_value}")
         self.optimizer.step(rate)
         self._update_average()
-        state["step"] += 1
-        state["loss_sum"] += loss_value
-        state["norm_sum"] += norm_value
-        state["logged"] += 1
-        if self.processes.leads and self.step % self.settings.log_every == 0:
-            count = state["logged"]
-            mean = state["loss_sum"] / count
-            if self.board:
-                self.board.add_scalar("loss", mean, self.step)
-                self.board.add_scalar("learning rate", rate, self.step)
-            self.log.add(self.step, f"{self.seconds():.3f}", repr(mean), repr(rate), repr(state["norm_sum"] / count), frames)
-            state["loss_sum"], state["norm_sum"], state["logged"] = 0.0, 0.0, 0
-            self._show(mean, rate)
+        self.progress_state["loss_sum"] += loss_value
+        self.progress_state["norm_sum"] += norm_value
+
+    def _diverged(self, what: str) -> NoReturn:
+        kept = "checkpoint.pt keeps good weights" if (self.folder / "checkpoint.pt").is_file() else "no checkpoint was written yet"
+        raise RunError(
+            f"{self.folder}: step {self.step}: {what}: training diverged; {kept}; "
+            f"start again with a smaller training.learning_rate (now {self.settings.learning_rate:g})"
+        )
+
+    def _replay_of(self, windows: Windows) -> TrainingReplay:
+        from learn.replay import TrainingReplay  # not above: it needs Triton
+
+        rows = self.settings.batch * max(shape[1] for shape in self.train_data.shapes)
+        clip = self.settings.gradient_clip or math.inf
+        return TrainingReplay(self.model, self.parameters, self.optimizer, self.average, clip, windows, rows)
+
+    def _settle(self) -> None:
+        """Learn what became of replayed steps."""
+        if self._replay is None:
+            return
+        loss, norm, bad, full = self._replay.settle()
+        self.progress_state["loss_sum"] += loss
+        self.progress_state["norm_sum"] += norm
+        if bad:
+            self._diverged(f"{bad} steps with a loss or a gradient that is not finite")
+        if full:
+            self.progress_state["logged"] -= full
+            self._say(f"step {self.step}: {full} steps had more edges than there was room for and were skipped; there is more room now")
 
     def _join(self, loss: float, windows: Windows) -> float:
         """The loss and, in place, the gradient of the whole batch: those of the processes, weighted by the particles they are means over."""
@@ -507,10 +546,14 @@ class Trainer:
                 parameter.grad.mul_(share)
         return self.processes.add(self.parameters, [share * loss])[0]
 
+    def _decay(self) -> float:
+        """d = min(decay, (1 + n) / (10 + n)), so that the first steps are soon forgotten."""
+        return min(self.settings.average_decay, (1 + self.step) / (10 + self.step)) if self.settings.average_decay else 0.0
+
     @torch.no_grad()
     def _update_average(self) -> None:
-        """average <- d average + (1 - d) weights, d = min(decay, (1 + n) / (10 + n)) so that the first steps are soon forgotten."""
-        decay = min(self.settings.average_decay, (1 + self.step) / (10 + self.step)) if self.settings.average_decay else 0.0
+        """average <- d average + (1 - d) weights."""
+        decay = self._decay()
         current = self.model.state_dict()
         averaged = [name for name, value in current.items() if value.is_floating_point()]
         torch._foreach_lerp_([self.average[name] for name in averaged], [current[name] for name in averaged], 1 - decay)
@@ -542,6 +585,7 @@ class Trainer:
         return math.floor(progress * self.settings.validations) > state["validations"]
 
     def _validate(self) -> None:
+        self._settle()
         state, begun = self.progress_state, time.perf_counter()
         with self._averaged() as model:
             scores = []
@@ -580,6 +624,7 @@ class Trainer:
     # -- keeping -------------------------------------------------------------------------------------------------------------
 
     def _checkpoint(self) -> None:
+        self._settle()
         self.log.sync()
         self.validation.sync()
         self.progress_state["seconds"] = self.seconds()

@@ -1,0 +1,240 @@
+"""Steps of a GNS as CUDA graphs: a rollout's, and a training's with its optimiser.
+
+A step of a GNS is a few hundred small kernels, and to launch them takes a fast GPU longer than to run them. Captured once, over tensors that stay
+where they are, a step is one launch; nothing in it waits for the host. What differs from step to step (a batch, its noise, the learning
+rate) is copied into those tensors before; results are read when somebody wants to know them.
+
+Decisions: whole steps are captured, not parts, since every part has a search before it. Shapes are capacities (``learn.fused``): batches of fewer
+particles are filled up by rows that count for nothing, and a step whose edges exceed their capacity is no step, the capacity is raised. On a CPU
+(the tests') the same functions are called without a graph.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from learn.dataset import Windows
+from learn.fused import Search, Shadow
+from learn.graph import radius_graph
+
+if TYPE_CHECKING:
+    from learn.gns import GNS, _State
+
+#: Room for this many times the edges of the first batch of a training.
+ROOM = 1.5
+
+
+class Replay:
+    """``function`` of tensors that stay, captured at the first call; ``prepare`` is called before it is warmed up and again after."""
+
+    def __init__(self, device: torch.device, function: Callable[[], None], prepare: Callable[[], None]):
+        self.device, self.function, self.prepare, self.graph = device, function, prepare, None
+
+    def __call__(self) -> None:
+        if self.device.type != "cuda":
+            self.function()
+            return
+        if self.graph is None:
+            self.prepare()
+            stream = torch.cuda.Stream(self.device)
+            stream.wait_stream(torch.cuda.current_stream())
+            with torch.cuda.stream(stream):
+                self.function()  # compiles kernels, which a capture must not
+                self.function()
+            torch.cuda.current_stream().wait_stream(stream)
+            self.prepare()
+            self.graph = torch.cuda.CUDAGraph()
+            with torch.cuda.graph(self.graph):
+                self.function()
+        self.graph.replay()
+
+
+def _searching(model: GNS, bounds: np.ndarray, examples: int, capacity: int) -> Search:
+    return Search(bounds, model.radius, examples, capacity, model.options.self_edges, model.features.bounds.device)
+
+
+class RolloutReplay:
+    """Steps of the rollouts ``which`` together. ``compute`` predicts, ``accept`` makes that the present."""
+
+    def __init__(self, model: GNS, which: list[int], states: Sequence[_State], bounds: Tensor):
+        self.model, self.which, self.states = model, which, [states[number] for number in which]
+        self.bounds, device = bounds, model.features.bounds.device
+        counts = [len(state.kinds) for state in self.states]
+        self.ends = np.cumsum([0, *counts])
+        self.last = torch.from_numpy(self.ends).to(device)
+        self.kinds = torch.cat([state.kinds for state in self.states])
+        self.example = torch.repeat_interleave(torch.arange(len(counts), device=device), torch.tensor(counts, device=device))
+        self.present = torch.tensor([len(self.kinds)], dtype=torch.int32, device=device)
+        self.position = torch.cat([state.position for state in self.states], 1)
+        self.following = self.position.clone()
+        self.known = [state.known(model.spec.stride) for state in self.states]
+        self.context = None
+        if model.features.context:
+            self.context = torch.zeros(len(counts), len(self.states[0].context), device=device)
+        first = 0
+        for state in self.states:
+            if state.first_edges is None:
+                state.first_edges = max(radius_graph(state.position[-1], model.radius, None, model.options.self_edges).edges, len(state.kinds))
+            first += state.first_edges
+        self.search = _searching(model, states[0].start.bounds, len(counts), math.ceil(model.options.edge_cap * first) + 1)
+        model.network.shadow = Shadow(model.network)
+        model.network.shadow.refresh()
+        self.replay = Replay(device, self._step, lambda: None)
+
+    def _step(self) -> None:
+        model, position = self.model, self.position
+        model.search = self.search
+        try:
+            context = None if self.context is None else self.context[self.example]
+            graph = self.search(position[-1], self.example, self.present)
+            output = model._predict(position, graph, self.kinds, self.bounds, context)
+            acceleration = model.features.acceleration(output, position, self.bounds)
+        finally:
+            model.search = None
+        frames = []
+        for state, known, a, b in zip(self.states, self.known, self.ends[:-1], self.ends[1:], strict=True):
+            own = position[:, a:b]
+            following = model.following(state, own, acceleration[a:b], known)
+            frames.append(model.between(state, own, acceleration[a:b], following, known))
+        self.frames = torch.cat(frames, 1)
+        self.following.copy_(torch.cat([position[1:], self.frames[-1:]]))
+        # Counted before they are cut off at the capacity: a clump must not look smaller than it is.
+        self.found = torch.cat([graph.offsets[self.last], graph.found.view(1).int()])
+
+    def compute(self) -> tuple[list[np.ndarray], list[int]]:
+        """The next frames [stride, particles, dim] of each, and the edges that each has."""
+        for state, known in zip(self.states, self.known, strict=True):
+            if known is not None:
+                known.copy_(state.known(self.model.spec.stride))
+        if self.context is not None:
+            self.context.copy_(torch.from_numpy(np.stack([state.context for state in self.states])))
+        self.replay()
+        frames, found = self.frames.float().cpu().numpy(), self.found.tolist()
+        edges = np.diff(found[:-1]).tolist()
+        if found[-1] > self.search.capacity:
+            edges = [radius_graph(self.position[-1, a:b], self.model.radius, None, self.model.options.self_edges).edges
+                     for a, b in zip(self.ends[:-1], self.ends[1:], strict=True)]  # fmt: skip
+        return [np.ascontiguousarray(frames[:, a:b]) for a, b in zip(self.ends[:-1], self.ends[1:], strict=True)], edges
+
+    def accept(self) -> None:
+        """Go on from the frames that ``compute`` returned."""
+        self.position.copy_(self.following)
+        for state in self.states:
+            state.present += self.model.spec.stride
+
+    def release(self) -> None:
+        """Hand the present back to the states, for another set of them."""
+        for state, a, b in zip(self.states, self.ends[:-1], self.ends[1:], strict=True):
+            state.position = self.position[:, a:b].clone()
+
+
+class TrainingReplay:
+    """Training steps on batches of at most ``rows`` particles: loss, gradient, clipping, Adam, the average of the weights.
+
+    A step whose loss or gradient is not finite, or whose edges exceed their capacity, changes nothing; ``settle`` tells.
+    """
+
+    def __init__(self, model: GNS, parameters: list[nn.Parameter], optimizer, average: dict[str, Tensor], clip: float, first: Windows, rows: int):
+        self.model, self.parameters, self.optimizer, self.clip, self.average = model, parameters, optimizer, clip, average
+        self.device, self.rows, self.frames = model.features.bounds.device, rows, len(first.position)
+        self.examples, (_, particles, dim) = first.examples, first.position.shape
+        graph = radius_graph(first.position[model.velocities], model.radius, first.example, model.options.self_edges)
+        self.capacity = math.ceil(ROOM * graph.edges * rows / particles)
+
+        def pair(*shape: int, dtype: torch.dtype = torch.float32) -> tuple[Tensor, tuple[Tensor, Tensor]]:
+            # Written by the host while the device still reads the one before.
+            staging = [torch.zeros(shape, dtype=dtype, pin_memory=self.device.type == "cuda") for _ in range(2)]
+            return torch.zeros(shape, dtype=dtype, device=self.device), tuple(staging)
+
+        self.position, self._position = pair(self.frames, rows, dim)
+        self.noise, self._noise = pair(model.velocities + 1, rows, dim)
+        self.kinds, self._kinds = pair(rows, dtype=torch.int64)
+        self.example, self._example = pair(rows, dtype=torch.int64)
+        self.counted, self._counted = pair(rows, dtype=torch.bool)
+        self.context, self._context = pair(*first.context.shape) if first.context is not None else (None, (None, None))
+        self.numbers, self._numbers = pair(3)  # learning rate, decay of the average, 1 where nothing is to change
+        self.totals = torch.zeros(3, dtype=torch.float64, device=self.device)  # losses, gradient norms, steps that were none
+        self._none = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64, device=self.device)
+        self._copied = [torch.cuda.Event() for _ in range(2)] if self.device.type == "cuda" else None
+        self._turn, self._still = 0, False
+        model.network.shadow = Shadow(model.network)
+        self._begin()
+
+    def _begin(self) -> None:
+        self.search = _searching(self.model, np.asarray(self.model.spec.bounds), self.examples, self.capacity)
+        self.replay = Replay(self.device, self._step, self._prepare)
+
+    def _prepare(self) -> None:
+        """Warming up must not train."""
+        self._still = not self._still
+        self.numbers[2] = float(self._still)
+        for parameter in self.parameters:
+            parameter.grad = None
+        self.totals.zero_()
+        self.search.most.zero_()
+
+    def _step(self) -> None:
+        model = self.model
+        model.network.shadow.refresh()
+        model.search = self.search
+        try:
+            windows = Windows(self.position, self.kinds, self.example, self.context, counted=self.counted)
+            for parameter in self.parameters:
+                parameter.grad = None
+            loss = model.loss_under(self.noise, windows)
+            loss.backward()
+        finally:
+            model.search = None
+        norm = nn.utils.clip_grad_norm_(self.parameters, self.clip)
+        good = loss.isfinite() & norm.isfinite() & (self.search.most <= self.search.capacity) & (self.numbers[2] == 0)
+        parts = torch.stack([loss.detach(), norm, torch.zeros_like(norm)]).double()
+        self.totals += torch.where(good, parts, self._none)
+        self.optimizer.step(self.numbers[0], found_inf=1 - good.float())
+        own = model.state_dict()
+        names = [name for name, value in own.items() if value.is_floating_point()]
+        share = torch.where(good, 1 - self.numbers[1], 0.0)
+        averages = [self.average[name] for name in names]
+        difference = torch._foreach_sub([own[name] for name in names], averages)
+        torch._foreach_mul_(difference, share)
+        torch._foreach_add_(averages, difference)
+
+    def step(self, windows: Windows, generator: torch.Generator, rate: float, decay: float) -> None:
+        """One step on ``windows``, which are on the host, as is the generator of their noise; returns before the device has made it."""
+        turn, count = self._turn, windows.position.shape[1]
+        self._turn = 1 - turn
+        if self._copied:
+            self._copied[turn].synchronize()
+        given = {
+            "position": windows.position, "noise": self.model.noise(windows, generator), "kinds": windows.particle_type, "example": windows.example,
+        }
+        for name, value in given.items():
+            staging, axis = getattr(self, f"_{name}")[turn], int(value.ndim == 3)
+            staging.narrow(axis, 0, count).copy_(value)
+            staging.narrow(axis, count, self.rows - count).zero_()
+        self._counted[turn][:count], self._counted[turn][count:] = True, False
+        if self.context is not None:
+            self._context[turn].copy_(windows.context)
+        self._numbers[turn].copy_(torch.tensor([rate, decay, 0.0]))
+        for name in (*given, "counted", "numbers", *(["context"] if self.context is not None else [])):
+            getattr(self, name).copy_(getattr(self, f"_{name}")[turn], non_blocking=True)
+        if self._copied:
+            self._copied[turn].record()
+        self.replay()
+
+    def settle(self) -> tuple[float, float, int, int]:
+        """Since the last time: sums of losses and of gradient norms, steps that were none for a number that is not finite, and for want of room
+        (there is more afterwards). Waits for the device."""
+        loss, norm, none = self.totals.tolist()
+        self.totals.zero_()
+        most = int(self.search.most)
+        if most <= self.search.capacity:
+            return loss, norm, int(none), 0
+        self.capacity = math.ceil(ROOM * most)
+        self._begin()
+        return loss, norm, 0, int(none)
