@@ -30,7 +30,9 @@ ROOT = Path(__file__).resolve().parent.parent
 
 #: name -> latent, blocks of message passing.
 SIZES = {"full": (128, 10), "demo": (64, 5)}
-SPACING, RADIUS = 0.0158, 0.035
+RADIUS = 0.035
+#: About 15 neighbours in 2D, 30 in 3D.
+SPACING = {2: 0.0158, 3: 0.0184}
 
 
 def load_textbook() -> type[torch.nn.Module]:
@@ -42,17 +44,20 @@ def load_textbook() -> type[torch.nn.Module]:
     return module.TextbookNetwork
 
 
-def scene(particles: int) -> tuple[DataSpec, Windows, Start]:
-    """A jittered block of water-like particles with about 15 neighbours each, moving at about the paper's velocities."""
+def scene(particles: int, dim: int = 2) -> tuple[DataSpec, Windows, Start]:
+    """A jittered block of water-like particles, twice as wide as high, moving at about the paper's velocities."""
     rng = np.random.default_rng(0)
-    columns = int(np.ceil(np.sqrt(particles * 1.6)))
-    grid = np.stack(np.divmod(np.arange(particles), columns)[::-1], 1) * SPACING + 0.1
-    grid += rng.normal(0, 0.12 * SPACING, grid.shape)
-    velocity = 1e-3 + np.cumsum(rng.normal(0, 1e-4, (7, particles, 2)), 0)
+    spacing = SPACING[dim]
+    across = int(np.ceil((2 * particles) ** (1 / dim))) if dim == 2 else int(np.ceil((particles / 2) ** (1 / 3) * 2**0.5))
+    places = np.stack(np.unravel_index(np.arange(particles), (2 * particles // across, across) if dim == 2 else (particles, across, across)), 1)
+    grid = places[:, ::-1] * spacing + 0.1 + rng.normal(0, 0.12 * spacing, (particles, dim))
+    velocity = 1e-3 + np.cumsum(rng.normal(0, 1e-4, (7, particles, dim)), 0)
     position = (grid + np.cumsum(velocity, 0)).astype(np.float32)
+    upper = float(np.ceil(position.max() + 0.1))
+    gravity = (0,) * (dim - 1) + (-9.81,)
     spec = DataSpec(
-        dim=2, bounds=((0, 1), (0, 1)), radius=RADIUS, spacing=SPACING, frame_step=0.0025, stride=1, gravity=(0, -9.81), particle_types=(5,),
-        velocity_mean=(0, 0), velocity_std=(1.4e-3, 1.3e-3), acceleration_mean=(0, 0), acceleration_std=(1e-4, 1e-4),
+        dim=dim, bounds=((0, upper),) * dim, radius=RADIUS, spacing=spacing, frame_step=0.0025, stride=1, gravity=gravity, particle_types=(5,),
+        velocity_mean=(0,) * dim, velocity_std=(1.4e-3,) * dim, acceleration_mean=(0,) * dim, acceleration_std=(1e-4,) * dim,
     )
     windows = Windows(torch.from_numpy(position), torch.full((particles,), 5), torch.zeros(particles, dtype=torch.int64))
     start = Start(
