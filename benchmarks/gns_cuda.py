@@ -116,6 +116,7 @@ def measure(particles: int, dim: int, batch: int, latent: int, blocks: int, seco
     plain = build("gns", {"latent": latent, "message_passing": blocks}, spec).to(DEVICE)
     plain.load_state_dict(model.state_dict())
     plain.network = load_textbook()(plain.network)
+    plain.network.low_precision = False  # not to be replayed
     onto, generator = windows.to(DEVICE), torch.Generator().manual_seed(0)
     optimizer = torch.optim.Adam(plain.parameters(), 1e-6, fused=True)
 

@@ -1,17 +1,18 @@
 """GNS on a CUDA device: a search on the device, and Triton kernels that take a tile of edges through a whole MLP.
 
 A GNS in separate operations writes every layer of every edge to memory and reads it back, a few dozen passes over edges x latent a block. Here
-a program loads a tile of edges once, gathers what their particles contribute, goes through three layers and the LayerNorm in registers,
-and writes the new edges and the messages: three passes. Backward does the layers again instead of keeping them. Messages are summed along
-each receiver's run of edges, without atomics, so that a step is the same step every time.
+a program holds an MLP's weights and takes one tile of edges after the other: loads it once, gathers what its particles contribute, goes
+through three layers and the LayerNorm in registers, and writes the new edges and the messages. Messages are summed along each receiver's
+run of edges, without atomics, so that a step is the same step every time.
 
 Shapes are those of a capacity, never of the number of edges: what exceeds it is counted, and nobody but whoever reads that count waits
 for the device, so a step can be a CUDA graph (``learn.replay``).
 
-Decisions: products and edge latents in the network's precision (float32 as three TF32 products, which rounds like float32); sums, LayerNorm and
-particle latents float32, as on the CPU. Weight gradients are batched products of stored tiles: kept in registers they would leave no room
-for the layers. Particles are not sorted by place: their table of contributions fits in the cache that all programs share.
-``TRITON_INTERPRET=1`` runs the kernels on a CPU, which is how they are tested.
+Decisions: products and edge latents in bf16; sums, LayerNorm and particle latents float32, as on the CPU. For training the two hidden layers are kept:
+to make them again cost more than to write and read them. Weight gradients are batched products of kept tiles; in registers they would
+leave no room for the layers. Rows travel by tensor descriptors: pointers to a tile's elements would fill half the registers. Particles are not
+sorted by place: their table of contributions fits in the cache that all programs share. ``TRITON_INTERPRET=1`` runs the kernels on a
+CPU, which is how they are tested, in float32.
 """
 
 from __future__ import annotations
@@ -32,13 +33,12 @@ from triton.tools.tensor_descriptor import TensorDescriptor
 if TYPE_CHECKING:
     from learn.gns import MLP, Network
 
-#: Edges a program takes, and its warps; in backward it holds more of each edge.
-TILE, WARPS = 128, 8
-BACKWARD_TILE, BACKWARD_WARPS = 32, 8
-#: Particles a program takes: few, so that a few thousand keep all processors busy.
-NODE_TILE, NODE_WARPS = 32, 8
-#: The capacity is a multiple of the tiles and of the parts that a weight's gradient is summed in.
-PARTS = 64
+#: Rows a program takes at a time, and its warps forward and backward: what leaves all layers in registers (of Hopper, at latent 128).
+TILES = {"encoder": (64, 4, 4), "edge": (64, 4, 8), "node": (32, 8, 8)}
+#: Parts that a weight's gradient is summed in.
+PARTS = 32
+#: Edges a graph has room for are a multiple of this.
+ROOMS = 128
 #: Most cells along an axis of the search, by dimension: beyond, cells are larger than the radius.
 MOST_CELLS = {2: 1024, 3: 128}
 #: Latent widths the kernels are made for.
@@ -166,8 +166,7 @@ class Search:
     def __init__(self, bounds: np.ndarray, radius: float, examples: int, capacity: int, self_edges: bool, device: torch.device):
         bounds = np.asarray(bounds, float)
         self.self_edges = self_edges
-        tile = math.lcm(TILE, BACKWARD_TILE, PARTS)
-        self.capacity = -(-capacity // tile) * tile
+        self.capacity = -(-capacity // ROOMS) * ROOMS
         self.most = torch.zeros((), dtype=torch.int64, device=device)
         self.dim = len(bounds)
         cells = [int(min(max((b - a) // radius, 1), MOST_CELLS[self.dim])) for a, b in bounds]
@@ -219,124 +218,109 @@ class Search:
 #   node: W0 [sum, v] + b0; the result is added to v
 
 
-@triton.jit
-def _first_layer(x, x2, table, own, other, particles, live, row, j, w0, b0, WIDTH: tl.constexpr, LATENT: tl.constexpr,
-                 KIND: tl.constexpr):  # fmt: skip
-    k = tl.arange(0, WIDTH)
-    value = tl.load(x + row[:, None] * WIDTH + k[None, :], mask=live[:, None], other=0.0)
-    h = tl.dot(value.to(w0.dtype), w0.load([0, 0]).T) + tl.load(b0 + j)[None, :]
-    if KIND == "node":
-        value = tl.load(x2 + row[:, None] * LATENT + k[None, :], mask=live[:, None], other=0.0)
-        h = tl.dot(value.to(w0.dtype), w0.load([0, LATENT]).T, h)
-    if KIND == "edge":
-        h += tl.load(table + own[:, None] * LATENT + j[None, :], mask=live[:, None], other=0.0).to(tl.float32)
-        h += tl.load(table + (particles + other)[:, None] * LATENT + j[None, :], mask=live[:, None], other=0.0).to(tl.float32)
-    return tl.maximum(h, 0.0)
-
-
-@triton.jit
-def _layer(h, w, b, j):
-    return tl.dot(h.to(w.dtype), w.load([0, 0]).T) + tl.load(b + j)[None, :]
-
-
-@triton.jit(do_not_specialize=["particles", "rows"])
-def _forward_kernel(x, x2, table, receiver, sender, count, particles, w0, b0, w1, b1, w2, b2, gamma, beta, out, message, rows, epsilon,
-                    WIDTH: tl.constexpr, LATENT: tl.constexpr, BLOCK: tl.constexpr, KIND: tl.constexpr, UPDATE: tl.constexpr):  # fmt: skip
-    first = tl.program_id(0) * BLOCK
-    total = tl.load(count)
-    row, j = first + tl.arange(0, BLOCK), tl.arange(0, LATENT)
-    live, there = row < total, row < rows
-    at = row[:, None] * LATENT + j[None, :]
+@triton.jit(do_not_specialize=["particles", "padded"])
+def _forward_kernel(x, x2, table, receiver, sender, count, particles, w0, b0, w1, b1, w2, b2, gamma, beta, out, message, hidden, scales, padded,
+                    epsilon, WIDTH: tl.constexpr, LATENT: tl.constexpr, BLOCK: tl.constexpr, KIND: tl.constexpr, UPDATE: tl.constexpr,
+                    KEEP: tl.constexpr):  # fmt: skip
+    # With KEEP for backward: hidden [3 padded, latent], after the LayerNorm's division, after W1, after W0; scales [padded], what it divided by.
     # Rows that are not there become 0: backward multiplies them by 0, which does not make nothing of everything.
-    z = tl.zeros([BLOCK, LATENT], tl.float32)
-    if first < total:
-        own, other = row, row
-        if KIND == "edge":
-            own = tl.load(receiver + row, mask=live, other=0)
-            other = tl.load(sender + row, mask=live, other=0)
-        h = _first_layer(x, x2, table, own, other, particles, live, row, j, w0, b0, WIDTH, LATENT, KIND)
-        h = tl.maximum(_layer(h, w1, b1, j), 0.0)
-        z = _layer(h, w2, b2, j)
-        z -= (tl.sum(z, 1) / LATENT)[:, None]
-        z *= tl.rsqrt(tl.sum(z * z, 1) / LATENT + epsilon)[:, None]
-        z = z * tl.load(gamma + j)[None, :] + tl.load(beta + j)[None, :]
-        if KIND == "edge":
-            tl.store(message + at, z.to(message.dtype.element_ty), mask=live[:, None])
-            if UPDATE:
-                z += tl.load(x + at, mask=live[:, None], other=0.0).to(tl.float32)
-        if KIND == "node":
-            z += tl.load(x2 + at, mask=live[:, None], other=0.0)
-        z = tl.where(live[:, None], z, 0.0)
-    if UPDATE:
-        tl.store(out + at, z.to(out.dtype.element_ty), mask=there[:, None])
+    total, j = tl.load(count), tl.arange(0, LATENT)
+    weight0, weight1, weight2 = w0.load([0, 0]).T, w1.load([0, 0]).T, w2.load([0, 0]).T
+    if KIND == "node":
+        weight0_own = w0.load([0, LATENT]).T
+    for tile in range(tl.program_id(0), padded // BLOCK, tl.num_programs(0)):
+        first = tile * BLOCK
+        row = first + tl.arange(0, BLOCK)
+        live = row < total
+        z = tl.zeros([BLOCK, LATENT], tl.float32)
+        if first < total:
+            h = tl.dot(x.load([first, 0]).to(weight0.dtype), weight0) + tl.load(b0 + j)[None, :]
+            if KIND == "node":
+                h = tl.dot(x2.load([first, 0]).to(weight0.dtype), weight0_own, h)
+            if KIND == "edge":
+                to = tl.load(receiver + row, mask=live, other=0)
+                come = tl.load(sender + row, mask=live, other=0) + particles
+                gathered = tl.load(table + to[:, None] * LATENT + j[None, :]).to(tl.float32)
+                h += gathered + tl.load(table + come[:, None] * LATENT + j[None, :]).to(tl.float32)
+            low = tl.maximum(h, 0.0).to(weight0.dtype)
+            if KEEP:
+                hidden.store([2 * padded + first, 0], low)
+            low = tl.maximum(tl.dot(low, weight1) + tl.load(b1 + j)[None, :], 0.0).to(weight0.dtype)
+            if KEEP:
+                hidden.store([padded + first, 0], low)
+            z = tl.dot(low, weight2) + tl.load(b2 + j)[None, :]
+            z -= (tl.sum(z, 1) / LATENT)[:, None]
+            scale = tl.rsqrt(tl.sum(z * z, 1) / LATENT + epsilon)
+            z *= scale[:, None]
+            if KEEP:
+                hidden.store([first, 0], z.to(weight0.dtype))
+                tl.store(scales + row, scale)
+            z = z * tl.load(gamma + j)[None, :] + tl.load(beta + j)[None, :]
+            if KIND == "edge":
+                message.store([first, 0], z.to(weight0.dtype))
+                if UPDATE:
+                    z += x.load([first, 0]).to(tl.float32)
+            if KIND == "node":
+                z += x2.load([first, 0])
+            z = tl.where(live[:, None], z, 0.0)
+        elif KEEP:
+            for part in range(3):
+                hidden.store([part * padded + first, 0], z.to(weight0.dtype))
+        if UPDATE:
+            out.store([first, 0], z.to(out.dtype))
 
 
-@triton.jit(do_not_specialize=["particles", "capacity"])
-def _backward_kernel(x, x2, table, receiver, sender, count, particles, w0, b0, w1, b1, w2, b2, gamma, beta, grad_out, grad_sums,
-                     grad_x, grad_x2, hidden, grad_hidden, partial, capacity, epsilon, WIDTH: tl.constexpr, LATENT: tl.constexpr,
-                     BLOCK: tl.constexpr, KIND: tl.constexpr, UPDATE: tl.constexpr):  # fmt: skip
-    # hidden [2, capacity, latent]: after W1 and after W0; grad_hidden [3, ...]: gradients after W2, W1, W0; rows that are not there become 0.
-    # partial [programs, 5, latent]: this tile's share of the gradients of gamma, beta, b2, b1, b0.
-    program = tl.program_id(0)
-    first = program * BLOCK
-    total = tl.load(count)
-    row, j = first + tl.arange(0, BLOCK), tl.arange(0, LATENT)
-    live, there = row < total, row < capacity
-    at = row[:, None] * LATENT + j[None, :]
-    size = capacity.to(tl.int64) * LATENT
-    if first < total:
-        own, other = row, row
-        if KIND == "edge":
-            own = tl.load(receiver + row, mask=live, other=0)
-            other = tl.load(sender + row, mask=live, other=0)
-        h1 = _first_layer(x, x2, table, own, other, particles, live, row, j, w0, b0, WIDTH, LATENT, KIND)
-        h1 = h1.to(hidden.dtype.element_ty)
-        tl.store(hidden + size + at, h1, mask=there[:, None])
-        h2 = tl.maximum(_layer(h1, w1, b1, j), 0.0).to(hidden.dtype.element_ty)
-        tl.store(hidden + at, h2, mask=there[:, None])
-        z = _layer(h2, w2, b2, j)
-        z -= (tl.sum(z, 1) / LATENT)[:, None]
-        scale = tl.rsqrt(tl.sum(z * z, 1) / LATENT + epsilon)
-        z *= scale[:, None]
-        if KIND == "edge":
-            g = tl.load(grad_sums + own[:, None] * LATENT + j[None, :], mask=live[:, None], other=0.0)
-            if UPDATE:
-                g += tl.load(grad_out + at, mask=live[:, None], other=0.0).to(tl.float32)
+@triton.jit(do_not_specialize=["padded"])
+def _backward_kernel(receiver, count, w0, w1, w2, gamma, hidden, scales, grad_out, grad_sums, grad_x, grad_x2, grad_hidden, partial, padded,
+                     WIDTH: tl.constexpr, LATENT: tl.constexpr, BLOCK: tl.constexpr, KIND: tl.constexpr, UPDATE: tl.constexpr):  # fmt: skip
+    # grad_hidden [3 padded, latent]: gradients after W2, W1, W0, 0 in rows that are not there.
+    # partial [programs, 5, latent]: a program's share of the gradients of gamma, beta, b2, b1, b0. They wait in memory: in registers they would
+    # leave too little room for the layers.
+    total, j = tl.load(count), tl.arange(0, LATENT)
+    weight0, weight1, weight2 = w0.load([0, 0]), w1.load([0, 0]), w2.load([0, 0])
+    if KIND == "node":
+        weight0_own = w0.load([0, LATENT])
+    share = partial + tl.program_id(0) * 5 * LATENT + j
+    for part in range(5):
+        tl.store(share + part * LATENT, tl.zeros([LATENT], tl.float32))
+    for tile in range(tl.program_id(0), padded // BLOCK, tl.num_programs(0)):
+        first = tile * BLOCK
+        row = first + tl.arange(0, BLOCK)
+        live = row < total
+        if first < total:
+            z = hidden.load([first, 0]).to(tl.float32)
+            if KIND == "edge":
+                to = tl.load(receiver + row, mask=live, other=0)
+                g = tl.load(grad_sums + to[:, None] * LATENT + j[None, :])
+                if UPDATE:
+                    g += grad_out.load([first, 0]).to(tl.float32)
+            else:
+                g = grad_out.load([first, 0]).to(tl.float32)
+            g = tl.where(live[:, None], g, 0.0)
+            tl.store(share, tl.load(share) + tl.sum(g * z, 0))
+            tl.store(share + LATENT, tl.load(share + LATENT) + tl.sum(g, 0))
+            g *= tl.load(gamma + j)[None, :]
+            g = (g - (tl.sum(g, 1) / LATENT)[:, None] - z * (tl.sum(g * z, 1) / LATENT)[:, None]) * tl.load(scales + row)[:, None]
+            tl.store(share + 2 * LATENT, tl.load(share + 2 * LATENT) + tl.sum(g, 0))
+            low = g.to(weight2.dtype)
+            grad_hidden.store([first, 0], low)
+            g = tl.where(hidden.load([padded + first, 0]) > 0, tl.dot(low, weight2), 0.0)
+            tl.store(share + 3 * LATENT, tl.load(share + 3 * LATENT) + tl.sum(g, 0))
+            low = g.to(weight2.dtype)
+            grad_hidden.store([padded + first, 0], low)
+            g = tl.where(hidden.load([2 * padded + first, 0]) > 0, tl.dot(low, weight1), 0.0)
+            tl.store(share + 4 * LATENT, tl.load(share + 4 * LATENT) + tl.sum(g, 0))
+            low = g.to(weight2.dtype)
+            grad_hidden.store([2 * padded + first, 0], low)
+            back = tl.dot(low, weight0)
+            if KIND == "edge" and UPDATE:
+                back += grad_out.load([first, 0]).to(tl.float32)
+            grad_x.store([first, 0], back.to(grad_x.dtype))
+            if KIND == "node":
+                grad_x2.store([first, 0], tl.dot(low, weight0_own) + grad_out.load([first, 0]))
         else:
-            g = tl.load(grad_out + at, mask=live[:, None], other=0.0).to(tl.float32)
-        share = partial + program * 5 * LATENT + j
-        tl.store(share, tl.sum(g * z, 0))
-        tl.store(share + LATENT, tl.sum(g, 0))
-        g *= tl.load(gamma + j)[None, :]
-        g = (g - (tl.sum(g, 1) / LATENT)[:, None] - z * (tl.sum(g * z, 1) / LATENT)[:, None]) * scale[:, None]
-        tl.store(share + 2 * LATENT, tl.sum(g, 0))
-        low = g.to(grad_hidden.dtype.element_ty)
-        tl.store(grad_hidden + at, low, mask=there[:, None])
-        g = tl.where(h2 > 0, tl.dot(low, w2.load([0, 0])), 0.0)
-        tl.store(share + 3 * LATENT, tl.sum(g, 0))
-        low = g.to(grad_hidden.dtype.element_ty)
-        tl.store(grad_hidden + size + at, low, mask=there[:, None])
-        g = tl.where(h1 > 0, tl.dot(low, w1.load([0, 0])), 0.0)
-        tl.store(share + 4 * LATENT, tl.sum(g, 0))
-        low = g.to(grad_hidden.dtype.element_ty)
-        tl.store(grad_hidden + 2 * size + at, low, mask=there[:, None])
-        k = tl.arange(0, WIDTH)
-        back = tl.dot(low, w0.load([0, 0]))
-        if KIND == "edge" and UPDATE:
-            back += tl.load(grad_out + at, mask=live[:, None], other=0.0).to(tl.float32)
-        tl.store(grad_x + row[:, None] * WIDTH + k[None, :], back.to(grad_x.dtype.element_ty), mask=live[:, None])
-        if KIND == "node":
-            back = tl.dot(low, w0.load([0, LATENT]))
-            back += tl.load(grad_out + at, mask=live[:, None], other=0.0)
-            tl.store(grad_x2 + at, back, mask=live[:, None])
-    else:
-        nothing = tl.zeros([BLOCK, LATENT], tl.float32)
-        for part in range(2):
-            tl.store(hidden + part * size + at, nothing.to(hidden.dtype.element_ty), mask=there[:, None])
-        for part in range(3):
-            tl.store(grad_hidden + part * size + at, nothing.to(grad_hidden.dtype.element_ty), mask=there[:, None])
-        for part in range(5):
-            tl.store(partial + (program * 5 + part) * LATENT + j, tl.zeros([LATENT], tl.float32))
+            for part in range(3):
+                grad_hidden.store([part * padded + first, 0], tl.zeros([BLOCK, LATENT], weight2.dtype))
 
 
 @triton.jit
@@ -409,44 +393,61 @@ class Shadow:
         return self._of[mlp]
 
 
-def _run_forward(kind: str, weights: Weights, x: Tensor, out: Tensor | None, count: Tensor, *, x2: Tensor | None = None, table: Tensor | None = None,
-                 graph: PaddedGraph | None = None, message: Tensor | None = None, update: bool = True) -> None:
+@dataclass(frozen=True)
+class _Kept:
+    """What backward needs of an MLP's forward pass; rows in whole tiles."""
+
+    hidden: Tensor  # [3, padded, latent]: normalised, after W1, after W0
+    scales: Tensor  # [padded]: 1 / standard deviation
+
+
+def _tiled(values: Tensor, tile: int) -> TensorDescriptor:
+    return TensorDescriptor.from_tensor(values, [tile, values.shape[1]])
+
+
+def _programs(tiles: int, device: torch.device) -> int:
+    """One a processor, which takes one tile after the other and has the weights at hand."""
+    return min(tiles, torch.cuda.get_device_properties(device).multi_processor_count if device.type == "cuda" else 2)
+
+
+def _run_forward(kind: str, weights: Weights, x: Tensor, out: Tensor | None, count: Tensor, *, keep: bool, x2: Tensor | None = None,
+                 table: Tensor | None = None, graph: PaddedGraph | None = None, message: Tensor | None = None) -> _Kept | None:
     from learn.gns import NORM_EPSILON
 
-    tile, warps = (TILE, WARPS) if kind == "edge" else (NODE_TILE, NODE_WARPS)
-    if kind == "encoder" and len(x) % TILE == 0:
-        tile, warps = TILE, WARPS
-    none = x
-    _forward_kernel[(triton.cdiv(len(x), tile),)](
-        x, none if x2 is None else x2, none if table is None else table, graph.receiver if kind == "edge" else none,
-        graph.sender if kind == "edge" else none, count, graph.particles if kind == "edge" else 0, *weights.arguments(),
-        none if out is None else out, none if message is None else message, len(x), NORM_EPSILON,
-        WIDTH=x.shape[1], LATENT=len(weights.second), BLOCK=tile, KIND=kind, UPDATE=update, num_warps=warps)
+    tile, warps, _ = TILES[kind]
+    latent, tiles, edge = len(weights.second), triton.cdiv(len(x), tile), kind == "edge"
+    kept = None
+    if keep:
+        kept = _Kept(x.new_empty(3, tiles * tile, latent, dtype=weights.first.dtype), x.new_empty(tiles * tile, dtype=torch.float32))
+    given, none = _tiled(x, tile), x
+    _forward_kernel[(_programs(tiles, x.device),)](
+        given, given if x2 is None else _tiled(x2, tile), table if edge else none, graph.receiver if edge else none, graph.sender if edge else none,
+        count, graph.particles if edge else 0, *weights.arguments(), given if out is None else _tiled(out, tile),
+        given if message is None else _tiled(message, tile), _tiled(kept.hidden.flatten(0, 1), tile) if keep else given,
+        kept.scales if keep else none, tiles * tile, NORM_EPSILON,
+        WIDTH=weights.width, LATENT=latent, BLOCK=tile, KIND=kind, UPDATE=out is not None, KEEP=keep, num_warps=warps)  # fmt: skip
+    return kept
 
 
-def _run_backward(kind: str, weights: Weights, x: Tensor, count: Tensor, grad_out: Tensor | None, *, x2: Tensor | None = None,
-                  table: Tensor | None = None, graph: PaddedGraph | None = None, grad_sums: Tensor | None = None, grad_x_dtype: torch.dtype):
-    """(grad_x, grad_x2, gradient after W0 [rows, latent], weight gradients [W1, W2], partial sums of the vectors, W0's share of x)."""
-    from learn.gns import NORM_EPSILON
-
-    rows, latent, dtype = len(x), len(weights.second), weights.first.dtype
-    large = kind == "edge" or rows % TILE == 0
-    tile, warps = (BACKWARD_TILE, BACKWARD_WARPS) if large else (NODE_TILE, NODE_WARPS)
-    programs = triton.cdiv(rows, tile)
-    grad_x = torch.zeros_like(x, dtype=grad_x_dtype) if kind == "encoder" else torch.empty_like(x, dtype=grad_x_dtype)
-    grad_x2 = None if x2 is None else torch.empty_like(x2)
-    hidden, grad_hidden = (torch.empty(count_, rows, latent, dtype=dtype, device=x.device) for count_ in (2, 3))
-    partial = torch.empty(programs, 5, latent, dtype=torch.float32, device=x.device)
-    none = x
+def _run_backward(kind: str, weights: Weights, x: Tensor, kept: _Kept, count: Tensor, grad_out: Tensor | None, grad_x: Tensor, *,
+                  grad_x2: Tensor | None = None, graph: PaddedGraph | None = None, grad_sums: Tensor | None = None):
+    """Writes grad_x and grad_x2; returns the gradient after W0 [rows, latent], those of [W1, W2], those of [b0, b1, b2, gamma, beta]."""
+    tile, _, warps = TILES[kind]
+    rows, latent, tiles, edge = len(x), len(weights.second), triton.cdiv(len(x), tile), kind == "edge"
+    grad_hidden = x.new_empty(3, tiles * tile, latent, dtype=weights.first.dtype)
+    programs = _programs(tiles, x.device)
+    partial = x.new_empty(programs, 5, latent, dtype=torch.float32)
+    first, _, second, _, third, _, gamma, _ = weights.arguments()
+    given, none = _tiled(grad_x, tile), x
     _backward_kernel[(programs,)](
-        x, none if x2 is None else x2, none if table is None else table, graph.receiver if kind == "edge" else none,
-        graph.sender if kind == "edge" else none, count, graph.particles if kind == "edge" else 0, *weights.arguments(),
-        none if grad_out is None else grad_out, none if grad_sums is None else grad_sums, grad_x, none if grad_x2 is None else grad_x2,
-        hidden, grad_hidden, partial, rows, NORM_EPSILON,
-        WIDTH=x.shape[1], LATENT=latent, BLOCK=tile, KIND=kind, UPDATE=grad_out is not None, num_warps=warps)
-    second, first = _outer(grad_hidden[:2], hidden)
+        graph.receiver if edge else none, count, first, second, third, gamma, _tiled(kept.hidden.flatten(0, 1), tile), kept.scales,
+        given if grad_out is None else _tiled(grad_out, tile), grad_sums if edge else none, given,
+        given if grad_x2 is None else _tiled(grad_x2, tile),
+        _tiled(grad_hidden.flatten(0, 1), tile), partial, tiles * tile,
+        WIDTH=weights.width, LATENT=latent, BLOCK=tile, KIND=kind, UPDATE=grad_out is not None, num_warps=warps)  # fmt: skip
+    second, first = _outer(grad_hidden[:2, :rows], kept.hidden[1:, :rows])
     grad_gamma, grad_beta, grad_b2, grad_b1, grad_b0 = partial.sum(0)
-    return grad_x, grad_x2, grad_hidden[2], (first, second), (grad_b0, grad_b1, grad_b2, grad_gamma, grad_beta)
+    return grad_hidden[2, :rows], (first, second), (grad_b0, grad_b1, grad_b2, grad_gamma, grad_beta)
 
 
 def _outer(left: Tensor, right: Tensor) -> Tensor:
@@ -460,10 +461,11 @@ def _outer(left: Tensor, right: Tensor) -> Tensor:
 
 class _Encoder(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, weights: Weights, count: Tensor, inputs: int, out_dtype: torch.dtype, x: Tensor, *parameters: Tensor):
-        x = F.pad(x, (0, weights.first.shape[1] - inputs)).to(weights.first.dtype)
-        out = torch.empty(len(x), len(weights.second), dtype=out_dtype, device=x.device)
-        _run_forward("encoder", weights, x, out, count)
+    def forward(ctx, weights: Weights, count: Tensor, keep: bool, out_dtype: torch.dtype, x: Tensor, *parameters: Tensor):
+        inputs = x.shape[1]
+        x = F.pad(x, (0, weights.width - inputs)).to(weights.first.dtype)
+        out = x.new_empty(len(x), len(weights.second), dtype=out_dtype)
+        ctx.kept = _run_forward("encoder", weights, x, out, count, keep=keep)
         ctx.weights, ctx.inputs = weights, inputs
         ctx.save_for_backward(x, count)
         return out
@@ -472,8 +474,10 @@ class _Encoder(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx, grad: Tensor):
         x, count = ctx.saved_tensors
-        grad_x, _, after, (first, second), (b0, b1, b2, gamma, beta) = _run_backward(
-            "encoder", ctx.weights, x, count, grad.contiguous(), grad_x_dtype=torch.float32)
+        # The node encoder's is float32, the edge encoder's in the precision of products: one kernel for both.
+        grad = grad.to(x.dtype).contiguous()
+        grad_x = torch.zeros_like(x, dtype=torch.float32)
+        after, (first, second), (b0, b1, b2, gamma, beta) = _run_backward("encoder", ctx.weights, x, ctx.kept, count, grad, grad_x)
         (zeroth,) = _outer(after[None], x[None])
         return None, None, None, None, grad_x[:, : ctx.inputs], zeroth[:, : ctx.inputs], b0, first, b1, second, b2, gamma, beta
 
@@ -487,32 +491,33 @@ class _Block(torch.autograd.Function):
         latent = nodes.shape[1]
         table = torch.bmm(nodes.to(edge.first.dtype).expand(2, -1, -1), _pair(edge, latent).mT)
         message = torch.empty_like(edges)
-        updated = torch.empty_like(edges) if update and keep else edges
-        _run_forward("edge", edge, edges, updated, graph.count, table=table, graph=graph, message=message, update=update)
+        updated = None if not update else torch.empty_like(edges) if keep else edges
+        kept_edge = _run_forward("edge", edge, edges, updated, graph.count, keep=keep, table=table, graph=graph, message=message)
         sums = _segment_sum(message, graph, torch.empty_like(nodes))
         following = torch.empty_like(nodes)
-        _run_forward("node", node, sums, following, count, x2=nodes)
-        ctx.edge, ctx.node, ctx.graph, ctx.update = edge, node, graph, update
+        kept_node = _run_forward("node", node, sums, following, count, keep=keep, x2=nodes)
+        ctx.edge, ctx.node, ctx.graph, ctx.kept = edge, node, graph, (kept_edge, kept_node)
         ctx.set_materialize_grads(False)
-        ctx.save_for_backward(nodes, edges, table, sums, count)
-        return following, updated if update else None
+        ctx.save_for_backward(nodes, edges, sums, count)
+        return following, updated
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, grad_nodes: Tensor, grad_edges: Tensor | None):
-        nodes, edges, table, sums, count = ctx.saved_tensors
-        edge, node, graph, latent = ctx.edge, ctx.node, ctx.graph, nodes.shape[1]
-        grad_sums, grad_own, after, (node_first, node_second), node_vectors = _run_backward(
-            "node", node, sums, count, grad_nodes.contiguous(), x2=nodes, grad_x_dtype=torch.float32)
+        nodes, edges, sums, count = ctx.saved_tensors
+        edge, node, graph, latent, (kept_edge, kept_node) = ctx.edge, ctx.node, ctx.graph, nodes.shape[1], ctx.kept
+        grad_sums, grad_own = torch.empty_like(sums), torch.empty_like(nodes)
+        after, (node_first, node_second), node_vectors = _run_backward(
+            "node", node, sums, kept_node, count, grad_nodes.contiguous(), grad_sums, grad_x2=grad_own)
         node_zeroth = _outer(after.expand(2, -1, -1), torch.stack([sums, nodes]).to(after.dtype)).transpose(0, 1).reshape(latent, 2 * latent)
-        grad_edges, _, after, (edge_first, edge_second), edge_vectors = _run_backward(
-            "edge", edge, edges, graph.count, None if grad_edges is None else grad_edges.contiguous(), table=table, graph=graph,
-            grad_sums=grad_sums, grad_x_dtype=edges.dtype)
-        grad_table = torch.empty_like(table)
+        given, grad_edges = grad_edges, torch.empty_like(edges)
+        after, (edge_first, edge_second), edge_vectors = _run_backward(
+            "edge", edge, edges, kept_edge, graph.count, None if given is None else given.contiguous(), grad_edges, graph=graph, grad_sums=grad_sums)
+        low = nodes.to(edges.dtype)
+        grad_table = low.new_empty(2, *low.shape)
         _segment_sum(after, graph, grad_table[0])
         _segment_sum(after, graph, grad_table[1], graph.reverse)
         grad_own += torch.bmm(grad_table, _pair(edge, latent)).sum(0, dtype=torch.float32)
-        low = nodes.to(grad_table.dtype)
         edge_zeroth = torch.cat([_outer(after[None], edges[None]), _outer(grad_table, low.expand(2, -1, -1))])
         edge_zeroth = edge_zeroth.transpose(0, 1).reshape(latent, 3 * latent)
         return (None, None, None, None, None, None, grad_own, grad_edges, *_interleave(edge_zeroth, edge_first, edge_second, edge_vectors),
@@ -545,8 +550,8 @@ def forward(network: Network, nodes: Tensor, edges: Tensor, graph: PaddedGraph) 
     keep = torch.is_grad_enabled()
     rows = torch.full((1,), len(nodes), dtype=torch.int32, device=nodes.device)
     dtype = shadow.dtype
-    nodes = _Encoder.apply(shadow[network.encode_node], rows, nodes.shape[1], torch.float32, nodes, *_parameters(network.encode_node))
-    edges = _Encoder.apply(shadow[network.encode_edge], graph.count, edges.shape[1], dtype, edges, *_parameters(network.encode_edge))
+    nodes = _Encoder.apply(shadow[network.encode_node], rows, keep, torch.float32, nodes, *_parameters(network.encode_node))
+    edges = _Encoder.apply(shadow[network.encode_edge], graph.count, keep, dtype, edges, *_parameters(network.encode_edge))
     for _ in range(network.repeats):
         for block in network.processor:
             nodes, updated = _Block.apply(
