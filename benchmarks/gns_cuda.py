@@ -90,11 +90,10 @@ def errors(model: torch.nn.Module, windows: Windows) -> dict[str, float]:
     with torch.no_grad():
         nodes = model.features.nodes(onto.position[:6], onto.particle_type, model.features.bounds)
         edges = model.features.edges(onto.position[:6], found)
-    weight = torch.randn(len(nodes), model.spec.dim, device=DEVICE)
 
     def run(network, nodes, edges, graph):
         output = network(nodes, edges, graph)
-        gradients = torch.autograd.grad((output * weight).sum(), list(network.parameters()))
+        gradients = torch.autograd.grad(output.square().sum(), list(network.parameters()))
         return output.detach().double(), torch.cat([gradient.flatten().double() for gradient in gradients])
 
     double = load_textbook()(copy.deepcopy(model.network).double())

@@ -1,18 +1,19 @@
 """GNS on a CUDA device: a search on the device, and Triton kernels that take a tile of edges through a whole MLP.
 
 A GNS in separate operations writes every layer of every edge to memory and reads it back, a few dozen passes over edges x latent a block. Here
-a program holds an MLP's weights and takes one tile of edges after the other: loads it once, gathers what its particles contribute, goes
-through three layers and the LayerNorm in registers, and writes the new edges and the messages. Messages are summed along each receiver's
+a program loads a tile of edges once, gathers what its particles contribute, goes through three layers and the LayerNorm in registers, and writes
+the new edges and the messages. Messages are summed along each receiver's
 run of edges, without atomics, so that a step is the same step every time.
 
 Shapes are those of a capacity, never of the number of edges: what exceeds it is counted, and nobody but whoever reads that count waits
 for the device, so a step can be a CUDA graph (``learn.replay``).
 
-Decisions: products and edge latents in bf16; sums, LayerNorm and particle latents float32, as on the CPU. For training the two hidden layers are kept:
-to make them again cost more than to write and read them. Weight gradients are batched products of kept tiles; in registers they would
-leave no room for the layers. Rows travel by tensor descriptors: pointers to a tile's elements would fill half the registers. Particles are not
-sorted by place: their table of contributions fits in the cache that all programs share. ``TRITON_INTERPRET=1`` runs the kernels on a
-CPU, which is how they are tested, in float32.
+Decisions: products and edge latents in bf16; sums, LayerNorm and particle latents float32, as on the CPU. For training hidden layers are kept: to
+make them again costs more than to write and read them. Weight gradients are batched products of kept tiles; in registers they would leave
+no room for the layers. Rows travel by tensor descriptors: pointers to a tile's elements would fill half the registers. A program ends
+with its tile: programs that stay and hold the weights leave room for one each a processor, and nothing hides its waiting (a third
+slower). Particles are not sorted by place: their table of contributions fits in the cache that all programs share.
+``TRITON_INTERPRET=1`` runs the kernels on a CPU, which is how they are tested, in float32.
 """
 
 from __future__ import annotations
@@ -33,8 +34,9 @@ from triton.tools.tensor_descriptor import TensorDescriptor
 if TYPE_CHECKING:
     from learn.gns import MLP, Network
 
-#: Rows a program takes at a time, and its warps forward and backward: what leaves all layers in registers (of Hopper, at latent 128).
-TILES = {"encoder": (64, 4, 4), "edge": (64, 4, 8), "node": (32, 8, 8)}
+#: Rows a program takes, and its warps: what leaves all layers in registers (of Hopper, at latent 128). Backward's divide forward's.
+FORWARD = {"encoder": (64, 4), "edge": (64, 4), "node": (32, 8)}
+BACKWARD = {"encoder": (64, 4), "edge": (32, 4), "node": (32, 8)}
 #: Parts that a weight's gradient is summed in.
 PARTS = 32
 #: Edges a graph has room for are a multiple of this.
@@ -224,103 +226,92 @@ def _forward_kernel(x, x2, table, receiver, sender, count, particles, w0, b0, w1
                     KEEP: tl.constexpr):  # fmt: skip
     # With KEEP for backward: hidden [3 padded, latent], after the LayerNorm's division, after W1, after W0; scales [padded], what it divided by.
     # Rows that are not there become 0: backward multiplies them by 0, which does not make nothing of everything.
-    total, j = tl.load(count), tl.arange(0, LATENT)
-    weight0, weight1, weight2 = w0.load([0, 0]).T, w1.load([0, 0]).T, w2.load([0, 0]).T
-    if KIND == "node":
-        weight0_own = w0.load([0, LATENT]).T
-    for tile in range(tl.program_id(0), padded // BLOCK, tl.num_programs(0)):
-        first = tile * BLOCK
-        row = first + tl.arange(0, BLOCK)
-        live = row < total
-        z = tl.zeros([BLOCK, LATENT], tl.float32)
-        if first < total:
-            h = tl.dot(x.load([first, 0]).to(weight0.dtype), weight0) + tl.load(b0 + j)[None, :]
-            if KIND == "node":
-                h = tl.dot(x2.load([first, 0]).to(weight0.dtype), weight0_own, h)
-            if KIND == "edge":
-                to = tl.load(receiver + row, mask=live, other=0)
-                come = tl.load(sender + row, mask=live, other=0) + particles
-                gathered = tl.load(table + to[:, None] * LATENT + j[None, :]).to(tl.float32)
-                h += gathered + tl.load(table + come[:, None] * LATENT + j[None, :]).to(tl.float32)
-            low = tl.maximum(h, 0.0).to(weight0.dtype)
-            if KEEP:
-                hidden.store([2 * padded + first, 0], low)
-            low = tl.maximum(tl.dot(low, weight1) + tl.load(b1 + j)[None, :], 0.0).to(weight0.dtype)
-            if KEEP:
-                hidden.store([padded + first, 0], low)
-            z = tl.dot(low, weight2) + tl.load(b2 + j)[None, :]
-            z -= (tl.sum(z, 1) / LATENT)[:, None]
-            scale = tl.rsqrt(tl.sum(z * z, 1) / LATENT + epsilon)
-            z *= scale[:, None]
-            if KEEP:
-                hidden.store([first, 0], z.to(weight0.dtype))
-                tl.store(scales + row, scale)
-            z = z * tl.load(gamma + j)[None, :] + tl.load(beta + j)[None, :]
-            if KIND == "edge":
-                message.store([first, 0], z.to(weight0.dtype))
-                if UPDATE:
-                    z += x.load([first, 0]).to(tl.float32)
-            if KIND == "node":
-                z += x2.load([first, 0])
-            z = tl.where(live[:, None], z, 0.0)
-        elif KEEP:
-            for part in range(3):
-                hidden.store([part * padded + first, 0], z.to(weight0.dtype))
-        if UPDATE:
-            out.store([first, 0], z.to(out.dtype))
+    total, j, first = tl.load(count), tl.arange(0, LATENT), tl.program_id(0) * BLOCK
+    row = first + tl.arange(0, BLOCK)
+    live = row < total
+    z = tl.zeros([BLOCK, LATENT], tl.float32)
+    if first < total:
+        h = tl.dot(x.load([first, 0]).to(w0.dtype), w0.load([0, 0]).T) + tl.load(b0 + j)[None, :]
+        if KIND == "node":
+            h = tl.dot(x2.load([first, 0]).to(w0.dtype), w0.load([0, LATENT]).T, h)
+        if KIND == "edge":
+            to = tl.load(receiver + row, mask=live, other=0)
+            come = tl.load(sender + row, mask=live, other=0) + particles
+            gathered = tl.load(table + to[:, None] * LATENT + j[None, :]).to(tl.float32)
+            h += gathered + tl.load(table + come[:, None] * LATENT + j[None, :]).to(tl.float32)
+        low = tl.maximum(h, 0.0).to(w0.dtype)
+        if KEEP:
+            hidden.store([2 * padded + first, 0], low)
+        low = tl.maximum(tl.dot(low, w1.load([0, 0]).T) + tl.load(b1 + j)[None, :], 0.0).to(w0.dtype)
+        if KEEP:
+            hidden.store([padded + first, 0], low)
+        z = tl.dot(low, w2.load([0, 0]).T) + tl.load(b2 + j)[None, :]
+        z -= (tl.sum(z, 1) / LATENT)[:, None]
+        scale = tl.rsqrt(tl.sum(z * z, 1) / LATENT + epsilon)
+        z *= scale[:, None]
+        if KEEP:
+            hidden.store([first, 0], z.to(w0.dtype))
+            tl.store(scales + row, scale)
+        z = z * tl.load(gamma + j)[None, :] + tl.load(beta + j)[None, :]
+        if KIND == "edge":
+            message.store([first, 0], z.to(w0.dtype))
+            if UPDATE:
+                z += x.load([first, 0]).to(tl.float32)
+        if KIND == "node":
+            z += x2.load([first, 0])
+        z = tl.where(live[:, None], z, 0.0)
+    elif KEEP:
+        for part in range(3):
+            hidden.store([part * padded + first, 0], z.to(w0.dtype))
+    if UPDATE:
+        out.store([first, 0], z.to(out.dtype))
 
 
 @triton.jit(do_not_specialize=["padded"])
 def _backward_kernel(receiver, count, w0, w1, w2, gamma, hidden, scales, grad_out, grad_sums, grad_x, grad_x2, grad_hidden, partial, padded,
                      WIDTH: tl.constexpr, LATENT: tl.constexpr, BLOCK: tl.constexpr, KIND: tl.constexpr, UPDATE: tl.constexpr):  # fmt: skip
     # grad_hidden [3 padded, latent]: gradients after W2, W1, W0, 0 in rows that are not there.
-    # partial [programs, 5, latent]: a program's share of the gradients of gamma, beta, b2, b1, b0. They wait in memory: in registers they would
-    # leave too little room for the layers.
-    total, j = tl.load(count), tl.arange(0, LATENT)
-    weight0, weight1, weight2 = w0.load([0, 0]), w1.load([0, 0]), w2.load([0, 0])
-    if KIND == "node":
-        weight0_own = w0.load([0, LATENT])
+    # partial [programs, 5, latent]: this tile's share of the gradients of gamma, beta, b2, b1, b0.
+    total, j, first = tl.load(count), tl.arange(0, LATENT), tl.program_id(0) * BLOCK
     share = partial + tl.program_id(0) * 5 * LATENT + j
-    for part in range(5):
-        tl.store(share + part * LATENT, tl.zeros([LATENT], tl.float32))
-    for tile in range(tl.program_id(0), padded // BLOCK, tl.num_programs(0)):
-        first = tile * BLOCK
-        row = first + tl.arange(0, BLOCK)
-        live = row < total
-        if first < total:
-            z = hidden.load([first, 0]).to(tl.float32)
-            if KIND == "edge":
-                to = tl.load(receiver + row, mask=live, other=0)
-                g = tl.load(grad_sums + to[:, None] * LATENT + j[None, :])
-                if UPDATE:
-                    g += grad_out.load([first, 0]).to(tl.float32)
-            else:
-                g = grad_out.load([first, 0]).to(tl.float32)
-            g = tl.where(live[:, None], g, 0.0)
-            tl.store(share, tl.load(share) + tl.sum(g * z, 0))
-            tl.store(share + LATENT, tl.load(share + LATENT) + tl.sum(g, 0))
-            g *= tl.load(gamma + j)[None, :]
-            g = (g - (tl.sum(g, 1) / LATENT)[:, None] - z * (tl.sum(g * z, 1) / LATENT)[:, None]) * tl.load(scales + row)[:, None]
-            tl.store(share + 2 * LATENT, tl.load(share + 2 * LATENT) + tl.sum(g, 0))
-            low = g.to(weight2.dtype)
-            grad_hidden.store([first, 0], low)
-            g = tl.where(hidden.load([padded + first, 0]) > 0, tl.dot(low, weight2), 0.0)
-            tl.store(share + 3 * LATENT, tl.load(share + 3 * LATENT) + tl.sum(g, 0))
-            low = g.to(weight2.dtype)
-            grad_hidden.store([padded + first, 0], low)
-            g = tl.where(hidden.load([2 * padded + first, 0]) > 0, tl.dot(low, weight1), 0.0)
-            tl.store(share + 4 * LATENT, tl.load(share + 4 * LATENT) + tl.sum(g, 0))
-            low = g.to(weight2.dtype)
-            grad_hidden.store([2 * padded + first, 0], low)
-            back = tl.dot(low, weight0)
-            if KIND == "edge" and UPDATE:
-                back += grad_out.load([first, 0]).to(tl.float32)
-            grad_x.store([first, 0], back.to(grad_x.dtype))
-            if KIND == "node":
-                grad_x2.store([first, 0], tl.dot(low, weight0_own) + grad_out.load([first, 0]))
+    row = first + tl.arange(0, BLOCK)
+    live = row < total
+    if first < total:
+        z = hidden.load([first, 0]).to(tl.float32)
+        if KIND == "edge":
+            to = tl.load(receiver + row, mask=live, other=0)
+            g = tl.load(grad_sums + to[:, None] * LATENT + j[None, :])
+            if UPDATE:
+                g += grad_out.load([first, 0]).to(tl.float32)
         else:
-            for part in range(3):
-                grad_hidden.store([part * padded + first, 0], tl.zeros([BLOCK, LATENT], weight2.dtype))
+            g = grad_out.load([first, 0]).to(tl.float32)
+        g = tl.where(live[:, None], g, 0.0)
+        tl.store(share, tl.sum(g * z, 0))
+        tl.store(share + LATENT, tl.sum(g, 0))
+        g *= tl.load(gamma + j)[None, :]
+        g = (g - (tl.sum(g, 1) / LATENT)[:, None] - z * (tl.sum(g * z, 1) / LATENT)[:, None]) * tl.load(scales + row)[:, None]
+        tl.store(share + 2 * LATENT, tl.sum(g, 0))
+        low = g.to(w0.dtype)
+        grad_hidden.store([first, 0], low)
+        g = tl.where(hidden.load([padded + first, 0]) > 0, tl.dot(low, w2.load([0, 0])), 0.0)
+        tl.store(share + 3 * LATENT, tl.sum(g, 0))
+        low = g.to(w0.dtype)
+        grad_hidden.store([padded + first, 0], low)
+        g = tl.where(hidden.load([2 * padded + first, 0]) > 0, tl.dot(low, w1.load([0, 0])), 0.0)
+        tl.store(share + 4 * LATENT, tl.sum(g, 0))
+        low = g.to(w0.dtype)
+        grad_hidden.store([2 * padded + first, 0], low)
+        back = tl.dot(low, w0.load([0, 0]))
+        if KIND == "edge" and UPDATE:
+            back += grad_out.load([first, 0]).to(tl.float32)
+        grad_x.store([first, 0], back.to(grad_x.dtype))
+        if KIND == "node":
+            grad_x2.store([first, 0], tl.dot(low, w0.load([0, LATENT])) + grad_out.load([first, 0]))
+    else:
+        for part in range(3):
+            grad_hidden.store([part * padded + first, 0], tl.zeros([BLOCK, LATENT], w0.dtype))
+        for part in range(5):
+            tl.store(share + part * LATENT, tl.zeros([LATENT], tl.float32))
 
 
 @triton.jit
@@ -405,22 +396,17 @@ def _tiled(values: Tensor, tile: int) -> TensorDescriptor:
     return TensorDescriptor.from_tensor(values, [tile, values.shape[1]])
 
 
-def _programs(tiles: int, device: torch.device) -> int:
-    """One a processor, which takes one tile after the other and has the weights at hand."""
-    return min(tiles, torch.cuda.get_device_properties(device).multi_processor_count if device.type == "cuda" else 2)
-
-
 def _run_forward(kind: str, weights: Weights, x: Tensor, out: Tensor | None, count: Tensor, *, keep: bool, x2: Tensor | None = None,
                  table: Tensor | None = None, graph: PaddedGraph | None = None, message: Tensor | None = None) -> _Kept | None:
     from learn.gns import NORM_EPSILON
 
-    tile, warps, _ = TILES[kind]
+    tile, warps = FORWARD[kind]
     latent, tiles, edge = len(weights.second), triton.cdiv(len(x), tile), kind == "edge"
     kept = None
     if keep:
         kept = _Kept(x.new_empty(3, tiles * tile, latent, dtype=weights.first.dtype), x.new_empty(tiles * tile, dtype=torch.float32))
     given, none = _tiled(x, tile), x
-    _forward_kernel[(_programs(tiles, x.device),)](
+    _forward_kernel[(tiles,)](
         given, given if x2 is None else _tiled(x2, tile), table if edge else none, graph.receiver if edge else none, graph.sender if edge else none,
         count, graph.particles if edge else 0, *weights.arguments(), given if out is None else _tiled(out, tile),
         given if message is None else _tiled(message, tile), _tiled(kept.hidden.flatten(0, 1), tile) if keep else given,
@@ -431,32 +417,42 @@ def _run_forward(kind: str, weights: Weights, x: Tensor, out: Tensor | None, cou
 
 def _run_backward(kind: str, weights: Weights, x: Tensor, kept: _Kept, count: Tensor, grad_out: Tensor | None, grad_x: Tensor, *,
                   grad_x2: Tensor | None = None, graph: PaddedGraph | None = None, grad_sums: Tensor | None = None):
-    """Writes grad_x and grad_x2; returns the gradient after W0 [rows, latent], those of [W1, W2], those of [b0, b1, b2, gamma, beta]."""
-    tile, _, warps = TILES[kind]
-    rows, latent, tiles, edge = len(x), len(weights.second), triton.cdiv(len(x), tile), kind == "edge"
-    grad_hidden = x.new_empty(3, tiles * tile, latent, dtype=weights.first.dtype)
-    programs = _programs(tiles, x.device)
-    partial = x.new_empty(programs, 5, latent, dtype=torch.float32)
+    """Writes grad_x and grad_x2; returns the gradients after W2, W1, W0 [3, rows, latent] and those of [b0, b1, b2, gamma, beta]."""
+    tile, warps = BACKWARD[kind]
+    (_, padded, latent), rows, edge = kept.hidden.shape, len(x), kind == "edge"
+    tiles = padded // tile
+    grad_hidden = torch.empty_like(kept.hidden)
+    partial = x.new_empty(tiles, 5, latent, dtype=torch.float32)
     first, _, second, _, third, _, gamma, _ = weights.arguments()
     given, none = _tiled(grad_x, tile), x
-    _backward_kernel[(programs,)](
+    _backward_kernel[(tiles,)](
         graph.receiver if edge else none, count, first, second, third, gamma, _tiled(kept.hidden.flatten(0, 1), tile), kept.scales,
         given if grad_out is None else _tiled(grad_out, tile), grad_sums if edge else none, given,
         given if grad_x2 is None else _tiled(grad_x2, tile),
-        _tiled(grad_hidden.flatten(0, 1), tile), partial, tiles * tile,
+        _tiled(grad_hidden.flatten(0, 1), tile), partial, padded,
         WIDTH=weights.width, LATENT=latent, BLOCK=tile, KIND=kind, UPDATE=grad_out is not None, num_warps=warps)  # fmt: skip
-    second, first = _outer(grad_hidden[:2, :rows], kept.hidden[1:, :rows])
     grad_gamma, grad_beta, grad_b2, grad_b1, grad_b0 = partial.sum(0)
-    return grad_hidden[2, :rows], (first, second), (grad_b0, grad_b1, grad_b2, grad_gamma, grad_beta)
+    return grad_hidden[:, :rows], (grad_b0, grad_b1, grad_b2, grad_gamma, grad_beta)
 
 
-def _outer(left: Tensor, right: Tensor) -> Tensor:
-    """[n, a, b] float32: left [n, rows, a]^T right [n, rows, b], in parts that are summed in float32: one product of so many rows for so small a
-    result keeps few processors busy."""
-    n, rows, a = left.shape
-    parts = math.gcd(PARTS, rows)
-    product = left.reshape(n * parts, rows // parts, a).mT @ right.reshape(n * parts, rows // parts, -1)
-    return product.view(n, parts, a, -1).sum(1, dtype=torch.float32)
+class _Products:
+    """Gradients of weights [latent, latent], left [n, rows, latent]^T right [n, rows, latent] each, in parts that are summed in float32 all at
+    once: one product of so many rows for so small a result keeps few processors busy."""
+
+    def __init__(self, most: int, like: Tensor, *rows: int):
+        self.parts = math.gcd(PARTS, *rows)
+        self.values, self.count = like.new_empty(most, self.parts, like.shape[-1], like.shape[-1]), 0
+
+    def add(self, left: Tensor, right: Tensor) -> None:
+        n, rows, latent = left.shape
+        out = self.values[self.count : self.count + n].view(n * self.parts, latent, latent)
+        shape = (n * self.parts, rows // self.parts, latent)
+        torch.bmm(left.reshape(shape).mT, right.reshape(shape), out=out)
+        self.count += n
+
+    def sums(self) -> Tensor:
+        """[n, latent, latent] float32."""
+        return self.values[: self.count].sum(1, dtype=torch.float32)
 
 
 class _Encoder(torch.autograd.Function):
@@ -477,8 +473,12 @@ class _Encoder(torch.autograd.Function):
         # The node encoder's is float32, the edge encoder's in the precision of products: one kernel for both.
         grad = grad.to(x.dtype).contiguous()
         grad_x = torch.zeros_like(x, dtype=torch.float32)
-        after, (first, second), (b0, b1, b2, gamma, beta) = _run_backward("encoder", ctx.weights, x, ctx.kept, count, grad, grad_x)
-        (zeroth,) = _outer(after[None], x[None])
+        grads, (b0, b1, b2, gamma, beta) = _run_backward("encoder", ctx.weights, x, ctx.kept, count, grad, grad_x)
+        products = _Products(2, grads, len(x))
+        products.add(grads[:2], ctx.kept.hidden[1:, : len(x)])
+        second, first = products.sums()
+        parts = x.view(products.parts, -1, x.shape[1])
+        zeroth = (grads[2].reshape(products.parts, -1, grads.shape[-1]).mT @ parts).sum(0, dtype=torch.float32)
         return None, None, None, None, grad_x[:, : ctx.inputs], zeroth[:, : ctx.inputs], b0, first, b1, second, b2, gamma, beta
 
 
@@ -488,8 +488,8 @@ class _Block(torch.autograd.Function):
     @staticmethod
     def forward(ctx, edge: Weights, node: Weights, graph: PaddedGraph, count: Tensor, update: bool, keep: bool, nodes: Tensor, edges: Tensor,
                 *parameters: Tensor):
-        latent = nodes.shape[1]
-        table = torch.bmm(nodes.to(edge.first.dtype).expand(2, -1, -1), _pair(edge, latent).mT)
+        low = nodes.to(edge.first.dtype)
+        table = torch.bmm(low.expand(2, -1, -1), _pair(edge).mT)
         message = torch.empty_like(edges)
         updated = None if not update else torch.empty_like(edges) if keep else edges
         kept_edge = _run_forward("edge", edge, edges, updated, graph.count, keep=keep, table=table, graph=graph, message=message)
@@ -498,39 +498,45 @@ class _Block(torch.autograd.Function):
         kept_node = _run_forward("node", node, sums, following, count, keep=keep, x2=nodes)
         ctx.edge, ctx.node, ctx.graph, ctx.kept = edge, node, graph, (kept_edge, kept_node)
         ctx.set_materialize_grads(False)
-        ctx.save_for_backward(nodes, edges, sums, count)
+        ctx.save_for_backward(low, edges, sums, count)
         return following, updated
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, grad_nodes: Tensor, grad_edges: Tensor | None):
-        nodes, edges, sums, count = ctx.saved_tensors
-        edge, node, graph, latent, (kept_edge, kept_node) = ctx.edge, ctx.node, ctx.graph, nodes.shape[1], ctx.kept
-        grad_sums, grad_own = torch.empty_like(sums), torch.empty_like(nodes)
-        after, (node_first, node_second), node_vectors = _run_backward(
-            "node", node, sums, kept_node, count, grad_nodes.contiguous(), grad_sums, grad_x2=grad_own)
-        node_zeroth = _outer(after.expand(2, -1, -1), torch.stack([sums, nodes]).to(after.dtype)).transpose(0, 1).reshape(latent, 2 * latent)
-        given, grad_edges = grad_edges, torch.empty_like(edges)
-        after, (edge_first, edge_second), edge_vectors = _run_backward(
-            "edge", edge, edges, kept_edge, graph.count, None if given is None else given.contiguous(), grad_edges, graph=graph, grad_sums=grad_sums)
-        low = nodes.to(edges.dtype)
-        grad_table = low.new_empty(2, *low.shape)
-        _segment_sum(after, graph, grad_table[0])
-        _segment_sum(after, graph, grad_table[1], graph.reverse)
-        grad_own += torch.bmm(grad_table, _pair(edge, latent)).sum(0, dtype=torch.float32)
-        edge_zeroth = torch.cat([_outer(after[None], edges[None]), _outer(grad_table, low.expand(2, -1, -1))])
-        edge_zeroth = edge_zeroth.transpose(0, 1).reshape(latent, 3 * latent)
-        return (None, None, None, None, None, None, grad_own, grad_edges, *_interleave(edge_zeroth, edge_first, edge_second, edge_vectors),
-                *_interleave(node_zeroth, node_first, node_second, node_vectors))  # fmt: skip
+        low, edges, sums, count = ctx.saved_tensors
+        graph, (kept_edge, kept_node), (rows, latent) = ctx.graph, ctx.kept, low.shape
+        grad_sums, grad_own, grad_e = torch.empty_like(sums), torch.empty_like(sums), torch.empty_like(edges)
+        node, node_vectors = _run_backward("node", ctx.node, sums, kept_node, count, grad_nodes.contiguous(), grad_sums, grad_x2=grad_own)
+        grad_edges = None if grad_edges is None else grad_edges.contiguous()
+        edge, edge_vectors = _run_backward("edge", ctx.edge, edges, kept_edge, graph.count, grad_edges, grad_e, graph=graph, grad_sums=grad_sums)
+        grad_table = torch.empty_like(low.expand(2, -1, -1), memory_format=torch.contiguous_format)
+        _segment_sum(edge[2], graph, grad_table[0])
+        _segment_sum(edge[2], graph, grad_table[1], graph.reverse)
+        grad_own += torch.bmm(grad_table, _pair(ctx.edge)).sum(0, dtype=torch.float32)
+
+        products = _Products(9, edge, rows, len(edges))
+        products.add(edge[2:], edges[None])
+        products.add(grad_table, low.expand(2, -1, -1))
+        products.add(edge[:2], kept_edge.hidden[1:, : len(edges)])
+        products.add(node[2:], sums.to(low.dtype)[None])
+        products.add(node[2:], low[None])
+        products.add(node[:2], kept_node.hidden[1:, :rows])
+        own, *rest = products.sums().split([3, 2, 2, 2])
+        edge_weights = own.transpose(0, 1).reshape(latent, 3 * latent), *rest[0].flip(0)
+        node_weights = rest[1].transpose(0, 1).reshape(latent, 2 * latent), *rest[2].flip(0)
+        return None, None, None, None, None, None, grad_own, grad_e, *_each(edge_weights, edge_vectors), *_each(node_weights, node_vectors)
 
 
-def _pair(weights: Weights, latent: int) -> Tensor:
+def _pair(weights: Weights) -> Tensor:
     """[2, latent, latent]: the first layer's share of an edge's receiver and of its sender."""
-    return weights.first.view(latent, 3, latent)[:, 1:].transpose(0, 1)
+    return weights.first.view(len(weights.first), 3, -1)[:, 1:].transpose(0, 1)
 
 
-def _interleave(zeroth: Tensor, first: Tensor, second: Tensor, vectors: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+def _each(weights: tuple[Tensor, ...], vectors: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+    """In the order of ``_parameters``."""
     b0, b1, b2, gamma, beta = vectors
+    zeroth, first, second = weights
     return zeroth, b0, first, b1, second, b2, gamma, beta
 
 

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from learn.gns import GNS, _State
 
 #: Room for this many times the edges of the first batch of a training.
-ROOM = 1.5
+ROOM = 1.25
 
 
 class Replay:
@@ -142,10 +142,11 @@ class TrainingReplay:
 
     def __init__(self, model: GNS, parameters: list[nn.Parameter], optimizer, average: dict[str, Tensor], clip: float, first: Windows, rows: int):
         self.model, self.parameters, self.optimizer, self.clip, self.average = model, parameters, optimizer, clip, average
-        self.device, self.rows, self.frames = model.features.bounds.device, rows, len(first.position)
+        # Rows in whole tiles, and in whole parts of sums.
+        self.device, self.rows, self.frames = model.features.bounds.device, -(-rows // 64) * 64, len(first.position)
         self.examples, (_, particles, dim) = first.examples, first.position.shape
         graph = radius_graph(first.position[model.velocities], model.radius, first.example, model.options.self_edges)
-        self.capacity = math.ceil(ROOM * graph.edges * rows / particles)
+        self.capacity, rows = math.ceil(ROOM * graph.edges * rows / particles), self.rows
 
         def pair(*shape: int, dtype: torch.dtype = torch.float32) -> tuple[Tensor, tuple[Tensor, Tensor]]:
             # Written by the host while the device still reads the one before.
