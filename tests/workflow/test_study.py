@@ -46,6 +46,13 @@ def drop(*keys):
     return change
 
 
+def larger(content, learned):
+    """Adds a comparison in a larger box, whose errors are drawn beside."""
+    content["data"]["larger"] = content["data"]["puddle"] | {"variant": "larger"}
+    content["comparisons"]["larger"] = content["comparisons"]["puddle"] | {"data": "larger", "learned": learned, "films": [], "targets": []}
+    content["comparisons"]["puddle"]["generalisation"] = {"over": "scene", "with": ["larger"]}
+
+
 COMPARISON = ("comparisons", "puddle")
 MISTAKES = [
     (put("colour", value=1), "colour = 1: unknown key; the keys here are comparisons, data, models, stability, title"),
@@ -83,6 +90,11 @@ MISTAKES = [
     (put(*COMPARISON, "targets", 0, "metric", value="escaped_fraction"), "targets[0].at = 'all': escaped_fraction is one figure; leave it out"),
     (put(*COMPARISON, "axes", value={"size": {"gns": 1, "gsn": 2}}), "comparisons.puddle.axes.size = 'gsn': not among the learned: gns"),
     (put(*COMPARISON, "axes", value={"size": {"gns": 1}}), "comparisons.puddle.axes.size = ['gns']"),
+    (put(*COMPARISON, "generalisation", value={"with": []}), "comparisons.puddle.generalisation.over = None: missing"),
+    (put(*COMPARISON, "generalisation", value={"over": "colour"}), "generalisation.over = 'colour': not among particles, scene, which"),
+    (put(*COMPARISON, "generalisation", value={"over": "scene"}), "comparisons.puddle.generalisation.with = None: one scene has nothing"),
+    (put(*COMPARISON, "generalisation", value={"over": "particles", "with": ["puddle"]}), "with = 'puddle': not among the other comparisons: none"),
+    (lambda content: larger(content, ["gns"]), "generalisation.with = 'larger': must compare the same models, learned: [gns, grid]"),
     (put("models", "gns", "variant", value="big"), "variant = 'big': not among the variants (there are none)"),
     (put("stability", value={"a": ["rest"]}), "a study of stability has title and stability alone"),
     (lambda content: content["comparisons"].update(again=content["comparisons"]["puddle"]), "two comparisons share this one"),
@@ -148,9 +160,10 @@ def test_shipped_studies_resolve(place, name):
     jobs = planned(place, study=f"configs/studies/{name}.yaml")
     content = yaml.safe_load((place / "configs" / "studies" / f"{name}.yaml").read_text())
     comparisons, models = content["comparisons"].values(), content["models"].values()
-    # Ablations compare learned models with each other.
-    assert all(len(entry["ladder"]) >= (1 if "axes" in entry else 5) for entry in comparisons)
-    assert jobs.get("ablation", 0) == sum("axes" in entry for entry in comparisons)
+    # Ablations compare learned models with each other, and generalisation a model with itself.
+    assert all(len(entry["ladder"]) >= (1 if name in ("ablation", "generalisation") else 5) for entry in comparisons)
+    for figure, key in (("ablation", "axes"), ("generalisation", "generalisation")):
+        assert jobs.get(figure, 0) == sum(key in entry for entry in comparisons)
     assert jobs["errors"] == jobs["timing"] == jobs["figures"] == len(comparisons) and jobs["report"] == 1
     assert jobs.get("train", 0) == sum(len(model.get("seeds", [])) for model in models)
 
