@@ -85,7 +85,7 @@ def _measure(contender: Simulator, trajectory: Trajectory, settings: CompareSett
     )
     figures |= {
         "trajectory_seed": trajectory.seed, "model_seed": contender.settings.get("seed"), "status": run.status,
-        "particles": int(moving.sum()), "context": _context_numbers(trajectory),
+        "particles": trajectory.position.shape[1], "context": _context_numbers(trajectory),
         "seconds_per_frame": run.seconds / done if done else math.nan,
     }
     before, true, period = trajectory.position[present, moving], trajectory.position[history:, moving], trajectory.period

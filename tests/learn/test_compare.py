@@ -82,7 +82,7 @@ def test_rows_of_known_error():
     assert off["seconds_per_simulated_second"] == pytest.approx(off["seconds_per_frame"] / 0.01)
     assert off["divergence_time"] is None and off["first_non_finite"] is None
     assert len(off["spread"]["per_trajectory"]) == 3 and off["spread"]["per_trajectory"][1]["trajectory_seed"] == 1
-    assert [(run["particles"], run["context"]) for run in off["spread"]["per_trajectory"]] == [(9, {})] * 3
+    assert [(run["particles"], run["context"]) for run in off["spread"]["per_trajectory"]] == [(10, {})] * 3
     assert off["spread"]["min"]["rollout_mse"]["all"] <= off["rollout_mse"]["all"] <= off["spread"]["max"]["rollout_mse"]["all"]
     assert off["curves"]["frame"] == [1, 3, 5, 8, 10]
     assert off["curves"]["mse"]["median"] == pytest.approx([0.05**2] * 5, rel=1e-4)
