@@ -1,5 +1,6 @@
 """Studies: the shipped ones are sound and resolve; every mistake is one line with file, key, value and remedy, and nothing is written."""
 
+import json
 from pathlib import Path
 
 import pytest
@@ -7,7 +8,9 @@ import yaml
 from study_tree import ROOT, make_tree, planned, snakemake
 
 from sim.errors import InputError
+from sim.scene import SceneFamily
 from sim.stability import CASES
+from workflow.results import trained_on
 from workflow.study import load_study
 
 
@@ -185,6 +188,27 @@ def test_the_paper_study_is_the_papers_size():
     config = study.configs["gns"]
     assert (config["settings"]["latent"], config["settings"]["message_passing"], config["training"]["batch"]) == (128, 10, 2)
     assert float(config["settings"]["noise"]) == 6.7e-4
+
+
+@pytest.mark.parametrize(("over", "known"), [("particles", [(352, 616)]), ("sand.friction_angle", [(15, 30), (55, 70)])])
+def test_what_a_checkpoint_was_trained_on(place, monkeypatch, over, known):
+    monkeypatch.chdir(place)
+
+    def change(content):
+        content["data"]["sand"] = {"scene": "configs/scenes/sand_angles.yaml", "test": 2}
+        content["models"]["heap"] = {"checkpoint": "pretrained/heap/best.pt"}
+        comparison = {"data": "sand", "learned": ["heap"], "films": [], "targets": [], "generalisation": {"over": over}}
+        content["comparisons"] = {"sand": content["comparisons"]["puddle"] | comparison}
+
+    shipped = Path("pretrained/heap")
+    shipped.mkdir(exist_ok=True)
+    (shipped / "best.pt").touch()
+    study = load_study(write(place, change))
+    (shipped / "dataset.json").unlink(missing_ok=True)
+    assert trained_on(study, "sand") == {}
+    family = SceneFamily.load("configs/scenes/sand_angles.yaml").to_dict()
+    (shipped / "dataset.json").write_text(json.dumps({"family": family, "statistics": {"particles": [352, 480.0, 616]}}))
+    assert trained_on(study, "sand") == {"heap": known}
 
 
 def test_one_study_keeps_nothing_of_another(place, monkeypatch):
