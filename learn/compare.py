@@ -85,6 +85,7 @@ def _measure(contender: Simulator, trajectory: Trajectory, settings: CompareSett
     )
     figures |= {
         "trajectory_seed": trajectory.seed, "model_seed": contender.settings.get("seed"), "status": run.status,
+        "particles": trajectory.position.shape[1], "context": _context_numbers(trajectory),
         "seconds_per_frame": run.seconds / done if done else math.nan,
     }
     before, true, period = trajectory.position[present, moving], trajectory.position[history:, moving], trajectory.period
@@ -97,6 +98,12 @@ def _measure(contender: Simulator, trajectory: Trajectory, settings: CompareSett
         "kinetic_energy": energy(run.position[:, moving]), "kinetic_energy_true": energy(true),
     }
     return figures, curves
+
+
+def _context_numbers(trajectory: Trajectory) -> dict[str, float]:
+    """Numbers that the scene's ``context`` names, the same in every frame: name -> value. They are the last columns."""
+    names = trajectory.scene.get("context") or []
+    return dict(zip(names, trajectory.context[0, -len(names) :].tolist(), strict=True)) if names else {}
 
 
 def plain(value: object) -> object:
@@ -122,7 +129,7 @@ def _aggregate(runs: list[dict], reduce) -> dict:
     return result
 
 
-_LABELS = ("trajectory_seed", "model_seed", "status")
+_LABELS = ("trajectory_seed", "model_seed", "status", "particles", "context")
 
 
 def _figures(runs: list[dict]) -> list[dict]:

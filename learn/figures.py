@@ -23,6 +23,7 @@ from matplotlib.colors import to_rgb  # noqa: E402
 from matplotlib.figure import Figure  # noqa: E402
 
 from learn.compare import MOVING_MSE, Yardstick, pareto_front  # noqa: E402
+from learn.generalisation import PARTICLES, SCENE, Trial, groups, trials  # noqa: E402
 from sim.errors import InputError  # noqa: E402
 from sim.trajectory import atomic_path  # noqa: E402
 
@@ -256,6 +257,75 @@ def ablation(rows: Sequence[dict], axes: dict[str, dict[str, str | float]], path
         for panel, axis in zip(panels[-1], axes, strict=True):
             panel.set_xlabel(axis)
         _save(figure, path)
+
+
+def generalisation(rows: Sequence[dict], over: str, trained: dict[str, Sequence[tuple[float, float]]], path: str | Path) -> None:
+    """Rollout error beyond the training, a column a learned contender: above as it is, below over that of the trajectory's best trivial baseline.
+    A dot a rollout; a bar the median of a scene, or of what lies between the ends of what was trained on, which is shaded; a cross at the top a
+    rollout that failed.
+
+    rows: of one scene or several; over: as in ``learn.generalisation``; trained: contender -> [low, high] of ``over``, where known."""
+    scenes = list(dict.fromkeys(row["scene"] for row in rows))
+    models = list(dict.fromkeys(row["contender"] for row in rows if row["kind"] == "learned"))
+    with plt.rc_context(_STYLE):
+        size = (1.5 + 5.2 * len(models), 6.4)
+        figure, panels = plt.subplots(2, len(models), figsize=size, sharex=True, sharey="row", squeeze=False, layout="constrained")
+        notes = []
+        for (above, below), model in zip(panels.T, models, strict=True):
+            found = trials(rows, model, over)
+            ranges = trained.get(model, ())
+            for panel, key in ((above, "error"), (below, "ratio")):
+                panel.set(yscale="log", xscale="log" if over == PARTICLES else "linear")
+                for low, high in ranges:
+                    panel.axvspan(low, high, color=COLOURS["oracle"], alpha=0.13, lw=0, zorder=0)
+                _dots(panel, found, key, COLOURS["learned"], MARKERS["learned"])
+            _dots(above, found, "trivial", COLOURS["trivial"], MARKERS["trivial"])
+            floors = [trial for trial in found if trial.floor]
+            lowest = min([trial.error for trial in found if trial.error > 0], default=0.0)
+            if floors and max(trial.floor for trial in floors) > lowest / 10:
+                _dots(above, floors, "floor", COLOURS["floor"], MARKERS["floor"])
+            elif floors:
+                notes.append(f"Chaos floor of {model} below the axis: at most {max(trial.floor for trial in floors):.1e}.")
+            below.axhline(1, color=COLOURS["trivial"], lw=1.2, ls=(0, (4, 2)))
+            for group in groups(found, over, ranges):
+                ends = _ends([trial.value for trial in group.trials], over)
+                for panel, key, colour in ((above, "error", "learned"), (above, "trivial", "trivial"), (below, "ratio", "learned")):
+                    if math.isfinite(group.median(key)):
+                        panel.plot(ends, [group.median(key)] * 2, color=COLOURS[colour], lw=2.4, zorder=3, solid_capstyle="butt")
+            above.set_title(model)
+            below.set_xlabel({PARTICLES: "particles", SCENE: ""}.get(over, over.replace(".", " ").replace("_", " ")))
+            if over == SCENE:
+                below.set_xticks(range(len(scenes)), scenes)
+        panels[0, 0].set_ylabel("rollout MSE, length\u00b2")
+        panels[1, 0].set_ylabel("over the best trivial baseline's")
+        handles = [
+            plt.Line2D([], [], color=COLOURS[kind], marker=MARKERS[kind], ls="", label=label)
+            for kind, label in (("learned", "learned, a rollout"), ("trivial", "best trivial baseline of the trajectory"))
+        ]
+        handles.append(plt.Line2D([], [], color="#444444", lw=2.4, label="median"))
+        if any(trained.values()):
+            handles.append(plt.Rectangle((0, 0), 1, 1, color=COLOURS["oracle"], alpha=0.25, lw=0, label="trained on"))
+        figure.legend(handles=handles, loc="outside upper center", ncols=2)
+        if notes:
+            figure.supxlabel("\n".join(notes), fontsize=8.5, color="#555555", wrap=True)
+        _save(figure, path)
+
+
+def _ends(values: Sequence[float], over: str) -> tuple[float, float]:
+    """Where the bar of a median begins and ends: a little beyond the values."""
+    if over == PARTICLES:
+        return min(values) / 1.08, max(values) * 1.08
+    beyond = 0.3 if over == SCENE else 0.5
+    return min(values) - beyond, max(values) + beyond
+
+
+def _dots(panel: Axes, found: Sequence[Trial], key: str, colour: str, marker: str) -> None:
+    """Trials by their values; crosses at the top for those without an error."""
+    known = [(trial.value, getattr(trial, key)) for trial in found if math.isfinite(getattr(trial, key))]
+    panel.plot(*np.array(known).reshape(-1, 2).T, marker, color=colour, alpha=0.45, markersize=5, lw=0)
+    failed = [trial.value for trial in found if math.isinf(getattr(trial, key))]
+    if failed:
+        panel.plot(failed, [0.97] * len(failed), "x", color=COLOURS["reference"], transform=panel.get_xaxis_transform(), lw=0)
 
 
 def _read_columns(path: Path, columns: Sequence[str]) -> dict[str, np.ndarray]:

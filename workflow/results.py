@@ -9,7 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from learn.compare import Target, Yardstick, analyse, verdict
-from learn.report import Asset, SceneAssets
+from learn.generalisation import PARTICLES, SCENE, groups, trials
+from learn.report import Asset, SceneAssets, number
+from sim.scene import SceneFamily
 from workflow.rows import timed_rows
 from workflow.study import PARTS, Study
 
@@ -20,14 +22,12 @@ def _read(path: str | Path) -> dict:
 
 def _cost(study: Study, model: str) -> dict | None:
     """What data and training of a model took; of a checkpoint, what is shipped beside it says so (``dataset.json``, ``done.json``)."""
-    entry = study.models[model]
-    if "checkpoint" in entry:
-        folder = Path(entry["checkpoint"]).parent
-        content, done = folder / "dataset.json", [folder / "done.json"]
+    content = study.training_content(model)
+    if "checkpoint" in study.models[model]:
+        done = [content.with_name("done.json")]
         if not (content.is_file() and done[0].is_file()):
             return None
     else:
-        content = study.data_stamp(entry["data"], "learning")
         done = [path.with_suffix(".json") for path in study.model_files(model)]
     splits = _read(content)["splits"]
     runs = [_read(path) for path in done]
@@ -37,6 +37,23 @@ def _cost(study: Study, model: str) -> dict | None:
         "trajectories": splits["train"]["ok"], "parameters": runs[0]["parameters"], "steps": int(np.mean([run["steps"] for run in runs])),
         "device": runs[0]["device"],
     }
+
+
+def trained_on(study: Study, comparison: str) -> dict[str, list[tuple[float, float]]]:
+    """Learned contender -> [low, high] of what its training had of the number that a comparison sets errors over; left out where unknown."""
+    over, known = study.comparisons[comparison]["generalisation"]["over"], {}
+    for model in study.comparisons[comparison]["learned"]:
+        place = study.training_content(model)
+        if over == SCENE or not place.is_file():
+            continue
+        content = _read(place)
+        if over == PARTICLES:
+            least, _, most = content["statistics"]["particles"]
+            known[model] = [(least, most)]
+        else:
+            spreads = SceneFamily(content["family"], place).spreads
+            known[model] = sorted(spreads[tuple(over.split("."))]["train"]) if tuple(over.split(".")) in spreads else []
+    return known
 
 
 def _targets(study: Study, comparison: str, scene: str) -> list[Target]:
@@ -87,6 +104,21 @@ def summarise(study: Study) -> dict:
     }
 
 
+def _generalisation(study: Study, comparison: str, summary: dict) -> str:
+    """The medians of the figure of generalisation in words."""
+    scenes = [study.families[study.comparisons[name]["data"]].model.name for name in study.generalised(comparison)]
+    rows = [row for scene in scenes for row in summary["rows"] if row["scene"] == scene]
+    over, trained = study.comparisons[comparison]["generalisation"]["over"], trained_on(study, comparison)
+    said = []
+    for model in study.comparisons[comparison]["learned"]:
+        parts = [
+            f"{group.name}{' (trained on)' if group.trained else ''} {number(group.median('error'))}, {number(group.median('ratio'))} times"
+            for group in groups(trials(rows, model, over), over, trained.get(model, ()))
+        ]
+        said.append(f"{model}: {'; '.join(parts)}.")
+    return f"Beyond the training. Median MSE of the rollout, and as a multiple of the best trivial baseline's. {' '.join(said)}"
+
+
 def assets(study: Study, summary: dict) -> dict[str, SceneAssets]:
     """Scene -> its pictures, as the rules made them."""
     result = {}
@@ -109,6 +141,7 @@ def assets(study: Study, summary: dict) -> dict[str, SceneAssets]:
             stills=[Asset(picture("strip.png"), "The same trajectory at six moments: teacher above, learned below.")] if films else [],
             figures=[
                 *([Asset(picture("ablation.svg"), "Ablations: each training a dot, their median a line.")] if entry["axes"] else []),
+                *([Asset(picture("generalisation.svg"), _generalisation(study, comparison, summary))] if "generalisation" in entry else []),
                 Asset(picture("error_over_run_time.svg"), "Error over run time, one thread each, the same machine."),
                 Asset(picture("error_over_time.svg"), "Error over time, with the chaos floor."),
                 Asset(picture("kinetic_energy.svg"), "Kinetic energy over time."),

@@ -18,6 +18,7 @@ from jsonschema import Draft202012Validator
 from jsonschema.exceptions import ValidationError, relevance
 
 from learn.compare import BEST_TRIVIAL
+from learn.generalisation import PARTICLES, SCENE
 from learn.metrics import CLOUD_METRICS, CLOUD_TIMES
 from learn.variants import with_variant
 from sim.errors import InputError
@@ -123,8 +124,18 @@ class Study:
         films = self.comparisons[comparison]["films"]
         names = [f"{model}.{suffix}" for model in films for suffix in ("mp4", "png")] + ["strip.png"] * bool(films)
         names += ["ablation.svg"] * bool(self.comparisons[comparison]["axes"])
+        names += ["generalisation.svg"] * ("generalisation" in self.comparisons[comparison])
         names += [f"{figure}.svg" for figure in FIGURES] + ["training.svg"] * bool(self.training_runs(comparison))
         return [self.picture(comparison, name) for name in names]
+
+    def generalised(self, comparison: str) -> list[str]:
+        """The comparisons whose trajectories its figure of generalisation draws, its own first."""
+        return [comparison, *self.comparisons[comparison]["generalisation"].get("with", [])]
+
+    def training_content(self, model: str) -> Path:
+        """``dataset.json`` of what a model was trained on; of a checkpoint it may be shipped beside it."""
+        entry = self.models[model]
+        return Path(entry["checkpoint"]).parent / "dataset.json" if "checkpoint" in entry else self.data_stamp(entry["data"], "learning")
 
     def training_runs(self, comparison: str) -> dict[str, Path]:
         """The trainings behind the learned contenders: label -> folder with ``log.csv`` and ``validation.csv``.
@@ -223,6 +234,9 @@ def load_study(path: str | Path) -> Study:
         content["comparisons"][name] = entry = {"horizons": [1, 5, 20, 100], "films": list(entry["learned"]), "targets": [], "axes": {}, **entry}
         entry["timing"] = {"repeats": 5, **entry["timing"]}
         _check_comparison(study, name, entry)
+    for name, entry in content["comparisons"].items():
+        if "generalisation" in entry:
+            _check_generalisation(study, name, entry)
     scenes = [families[entry["data"]].model.name for entry in content["comparisons"].values()]
     for name, scene in zip(content["comparisons"], scenes, strict=True):
         if scenes.count(scene) > 1:
@@ -294,6 +308,23 @@ def _check_comparison(study: Study, name: str, entry: dict) -> None:
         if at not in moments:
             remedy = f"{metric} is known at {', '.join(moments)}" if moments[0] else f"{metric} is one figure; leave it out"
             raise InputError(path, f"{where}.targets[{index}].at", target.get("at"), remedy)
+
+
+def _check_generalisation(study: Study, name: str, entry: dict) -> None:
+    path, where = study.path, f"comparisons.{name}.generalisation"
+    over, beside = entry["generalisation"]["over"], study.generalised(name)[1:]
+    others = [other for other in study.comparisons if other != name]
+    for other in beside:
+        if other not in others:
+            raise InputError(path, f"{where}.with", other, f"not among the other comparisons: {', '.join(others) or 'none'}")
+        if study.comparisons[other]["learned"] != entry["learned"]:
+            raise InputError(path, f"{where}.with", other, f"must compare the same models, learned: [{', '.join(entry['learned'])}]")
+    for shown in [name, *beside]:
+        known = [PARTICLES, SCENE, *study.families[study.comparisons[shown]["data"]].model.context]
+        if over not in known:
+            raise InputError(path, f"{where}.over", over, f"not among {', '.join(known)}, which trajectories of {shown} have")
+    if over == SCENE and not beside:
+        raise InputError(path, f"{where}.with", None, "one scene has nothing to be set beside; name other comparisons")
 
 
 def rung_settings(rung: dict) -> dict:

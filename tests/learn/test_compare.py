@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -81,10 +82,18 @@ def test_rows_of_known_error():
     assert off["seconds_per_simulated_second"] == pytest.approx(off["seconds_per_frame"] / 0.01)
     assert off["divergence_time"] is None and off["first_non_finite"] is None
     assert len(off["spread"]["per_trajectory"]) == 3 and off["spread"]["per_trajectory"][1]["trajectory_seed"] == 1
+    assert [(run["particles"], run["context"]) for run in off["spread"]["per_trajectory"]] == [(10, {})] * 3
     assert off["spread"]["min"]["rollout_mse"]["all"] <= off["rollout_mse"]["all"] <= off["spread"]["max"]["rollout_mse"]["all"]
     assert off["curves"]["frame"] == [1, 3, 5, 8, 10]
     assert off["curves"]["mse"]["median"] == pytest.approx([0.05**2] * 5, rel=1e-4)
     json.dumps(c.summary(rows), allow_nan=False)
+
+
+def test_rows_tell_the_numbers_of_a_context():
+    """The last columns, after the container's acceleration."""
+    truth = replace(TRUTHS[0], scene=TRUTHS[0].scene | {"context": ["sand.friction_angle"]}, context=np.tile(np.float32([1, 2, 37.5]), (16, 1)))
+    (row,) = c.compare([Frozen()], [truth], SETTINGS)
+    assert row["spread"]["per_trajectory"][0]["context"] == {"sand.friction_angle": 37.5} and "context" not in row["mean"]
 
 
 def test_failures_are_rows():

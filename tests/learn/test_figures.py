@@ -61,6 +61,44 @@ def test_ablation_shows_every_training_and_medians(tmp_path, kept):
     assert [label.get_text() for label in rollout[1].get_xticklabels()] == ["own", "one"] and rollout[0].get_xlabel() == "steps"
 
 
+def test_generalisation_shows_every_rollout_medians_and_what_was_trained_on(tmp_path, kept):
+    def shown(scene, name, kind, errors):
+        runs = [
+            {"trajectory_seed": k, "particles": {"small": 500, "large": 2500}[scene] + k, "context": {}, "rollout_mse_moving": {"all": error}}
+            for k, error in enumerate(errors)
+        ]
+        return row(name, kind, 1e-5, 1e-3, scene=scene) | {"spread": {"per_trajectory": runs}}
+
+    rows = [
+        shown("small", "gns", "learned", [1e-4, 2e-4, 3e-4]), shown("small", "frozen", "trivial", [1e-2] * 3),
+        shown("small", "floor", "floor", [1e-12] * 3),
+        shown("large", "gns", "learned", [4e-3, None, 6e-3]), shown("large", "frozen", "trivial", [2e-3] * 3),
+    ]
+    figures.generalisation(rows, "particles", {"gns": [(450, 600)]}, tmp_path / "figure.svg")
+    above, below = kept[0].axes
+
+    def lines(panel, marker):
+        return [list(zip(*line.get_data(), strict=True)) for line in panel.lines if line.get_marker() == marker]
+
+    assert lines(above, "s") == [[(500, 1e-4), (501, 2e-4), (502, 3e-4), (2500, 4e-3), (2502, 6e-3)]]
+    assert [point for point, _ in lines(above, "X")[0]] == [500, 501, 502, 2500, 2501, 2502]
+    assert np.allclose([ratio for _, ratio in lines(below, "s")[0]], [0.01, 0.02, 0.03, 2, 3])
+    assert [[x for x, _ in crosses] for crosses in lines(above, "x")] == [[2501]] == [[x for x, _ in crosses] for crosses in lines(below, "x")]
+    # Bars: medians, a failure being infinitely bad, just beyond their particles; the line at 1 is a baseline's.
+    bars = [(line.get_ydata()[0], *line.get_xdata()) for line in above.lines if line.get_linewidth() == 2.4 and line.get_color() == "#D55E00"]
+    assert [height for height, *_ in bars] == [2e-4, 6e-3] and bars[0][1] < 500 and bars[0][2] > 502
+    assert [line.get_ydata()[0] for line in below.lines if line.get_linewidth() == 2.4] == pytest.approx([0.02, 3])
+    assert (above.patches[0].get_x(), above.patches[0].get_width()) == (450, 150)
+    assert above.get_xscale() == above.get_yscale() == below.get_yscale() == "log"
+    assert "Chaos floor of gns below the axis: at most 1.0e-12." in kept[0].get_supxlabel()
+
+    figures.generalisation(rows, "scene", {}, tmp_path / "scenes.svg")
+    assert [label.get_text() for label in kept[1].axes[1].get_xticklabels()] == ["small", "large"] and not kept[1].axes[0].patches
+    first = (tmp_path / "scenes.svg").read_bytes()
+    figures.generalisation(rows, "scene", {}, tmp_path / "scenes.svg")
+    assert (tmp_path / "scenes.svg").read_bytes() == first
+
+
 def test_error_over_run_time(tmp_path, kept):
     path = tmp_path / "figure.png"
     figures.error_over_run_time(ROWS, path)

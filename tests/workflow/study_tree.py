@@ -29,6 +29,8 @@ bodies:
     shape: {kind: box, size: [[0.25, 0.35], [0.25, 0.35]]}
     center: [[0.4, 0.6], [0.3, 0.35]]
 splits: {train: 2, valid: 1, test: 2}
+variants:
+  larger: {bounds: [[0.1, 1.7], [0.1, 1.7]], cells: [32, 32]}
 """
 
 MICRO_GNS = """

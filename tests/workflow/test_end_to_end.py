@@ -165,6 +165,7 @@ comparisons:
     learned: [shipped]
     timing: {frames: 5}
     films: []
+    generalisation: {over: particles}
 """
 
 
@@ -181,4 +182,5 @@ def test_a_checkpoint_is_compared_without_training(copied):
     (row,) = [row for row in made["rows"] if row["kind"] == "learned"]
     assert row["contender"] == "shipped" and row["status"] == "ok" and row["cost"]["steps"] == 300
     page = (copied / "results" / "shipped" / "report.html").read_text()
-    assert "data:video" not in page and page.count("data:image/svg+xml") == 4  # three figures and the curve of the shipped training
+    assert "data:video" not in page and page.count("data:image/svg+xml") == 5  # four figures and the curve of the shipped training
+    assert "Median MSE of the rollout, and as a multiple of the best trivial baseline&#39;s. shipped: puddle" in page

@@ -1,5 +1,6 @@
 """Studies: the shipped ones are sound and resolve; every mistake is one line with file, key, value and remedy, and nothing is written."""
 
+import json
 from pathlib import Path
 
 import pytest
@@ -7,7 +8,9 @@ import yaml
 from study_tree import ROOT, make_tree, planned, snakemake
 
 from sim.errors import InputError
+from sim.scene import SceneFamily
 from sim.stability import CASES
+from workflow.results import trained_on
 from workflow.study import load_study
 
 
@@ -44,6 +47,13 @@ def drop(*keys):
         del content[keys[-1]]
 
     return change
+
+
+def larger(content, learned):
+    """Adds a comparison in a larger box, whose errors are drawn beside."""
+    content["data"]["larger"] = content["data"]["puddle"] | {"variant": "larger"}
+    content["comparisons"]["larger"] = content["comparisons"]["puddle"] | {"data": "larger", "learned": learned, "films": [], "targets": []}
+    content["comparisons"]["puddle"]["generalisation"] = {"over": "scene", "with": ["larger"]}
 
 
 COMPARISON = ("comparisons", "puddle")
@@ -83,6 +93,11 @@ MISTAKES = [
     (put(*COMPARISON, "targets", 0, "metric", value="escaped_fraction"), "targets[0].at = 'all': escaped_fraction is one figure; leave it out"),
     (put(*COMPARISON, "axes", value={"size": {"gns": 1, "gsn": 2}}), "comparisons.puddle.axes.size = 'gsn': not among the learned: gns"),
     (put(*COMPARISON, "axes", value={"size": {"gns": 1}}), "comparisons.puddle.axes.size = ['gns']"),
+    (put(*COMPARISON, "generalisation", value={"with": []}), "comparisons.puddle.generalisation.over = None: missing"),
+    (put(*COMPARISON, "generalisation", value={"over": "colour"}), "generalisation.over = 'colour': not among particles, scene, which"),
+    (put(*COMPARISON, "generalisation", value={"over": "scene"}), "comparisons.puddle.generalisation.with = None: one scene has nothing"),
+    (put(*COMPARISON, "generalisation", value={"over": "particles", "with": ["puddle"]}), "with = 'puddle': not among the other comparisons: none"),
+    (lambda content: larger(content, ["gns"]), "generalisation.with = 'larger': must compare the same models, learned: [gns, grid]"),
     (put("models", "gns", "variant", value="big"), "variant = 'big': not among the variants (there are none)"),
     (put("stability", value={"a": ["rest"]}), "a study of stability has title and stability alone"),
     (lambda content: content["comparisons"].update(again=content["comparisons"]["puddle"]), "two comparisons share this one"),
@@ -148,9 +163,10 @@ def test_shipped_studies_resolve(place, name):
     jobs = planned(place, study=f"configs/studies/{name}.yaml")
     content = yaml.safe_load((place / "configs" / "studies" / f"{name}.yaml").read_text())
     comparisons, models = content["comparisons"].values(), content["models"].values()
-    # Ablations compare learned models with each other.
-    assert all(len(entry["ladder"]) >= (1 if "axes" in entry else 5) for entry in comparisons)
-    assert jobs.get("ablation", 0) == sum("axes" in entry for entry in comparisons)
+    # Ablations compare learned models with each other, and generalisation a model with itself.
+    assert all(len(entry["ladder"]) >= (1 if name in ("ablation", "generalisation") else 5) for entry in comparisons)
+    for figure, key in (("ablation", "axes"), ("generalisation", "generalisation")):
+        assert jobs.get(figure, 0) == sum(key in entry for entry in comparisons)
     assert jobs["errors"] == jobs["timing"] == jobs["figures"] == len(comparisons) and jobs["report"] == 1
     assert jobs.get("train", 0) == sum(len(model.get("seeds", [])) for model in models)
 
@@ -172,6 +188,27 @@ def test_the_paper_study_is_the_papers_size():
     config = study.configs["gns"]
     assert (config["settings"]["latent"], config["settings"]["message_passing"], config["training"]["batch"]) == (128, 10, 2)
     assert float(config["settings"]["noise"]) == 6.7e-4
+
+
+@pytest.mark.parametrize(("over", "known"), [("particles", [(352, 616)]), ("sand.friction_angle", [(15, 30), (55, 70)])])
+def test_what_a_checkpoint_was_trained_on(place, monkeypatch, over, known):
+    monkeypatch.chdir(place)
+
+    def change(content):
+        content["data"]["sand"] = {"scene": "configs/scenes/sand_angles.yaml", "test": 2}
+        content["models"]["heap"] = {"checkpoint": "pretrained/heap/best.pt"}
+        comparison = {"data": "sand", "learned": ["heap"], "films": [], "targets": [], "generalisation": {"over": over}}
+        content["comparisons"] = {"sand": content["comparisons"]["puddle"] | comparison}
+
+    shipped = Path("pretrained/heap")
+    shipped.mkdir(exist_ok=True)
+    (shipped / "best.pt").touch()
+    study = load_study(write(place, change))
+    (shipped / "dataset.json").unlink(missing_ok=True)
+    assert trained_on(study, "sand") == {}
+    family = SceneFamily.load("configs/scenes/sand_angles.yaml").to_dict()
+    (shipped / "dataset.json").write_text(json.dumps({"family": family, "statistics": {"particles": [352, 480.0, 616]}}))
+    assert trained_on(study, "sand") == {"heap": known}
 
 
 def test_one_study_keeps_nothing_of_another(place, monkeypatch):

@@ -123,6 +123,27 @@ rule ablation:
         "{PYTHON} -m workflow.scripts.ablation {STUDY.path} {wildcards.comparison} {input.rows} {output} > {log} 2>&1"
 
 
+rule generalisation:
+    input:
+        lambda wildcards: [STUDY.comparison_file(name, "errors.json") for name in STUDY.generalised(wildcards.comparison)],
+    output:
+        f"{RESULTS}/pictures/{{comparison}}/generalisation.svg",
+    params:
+        code=lambda wildcards: STUDY.comparison_recipe(wildcards.comparison, ("generalisation",), "generalisation"),
+    log:
+        f"{RESULTS}/logs/generalisation/{{comparison}}.log",
+    benchmark:
+        f"{RESULTS}/benchmarks/generalisation/{{comparison}}.tsv"
+    threads: 1
+    resources:
+        mem_mb=2000,
+        runtime=10,
+    message:
+        "Figure of errors beyond the training of {wildcards.comparison}"
+    shell:
+        "{PYTHON} -m workflow.scripts.generalisation {STUDY.path} {wildcards.comparison} {output} {input} > {log} 2>&1"
+
+
 rule training_curve:
     input:
         learned_models,
