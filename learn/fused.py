@@ -523,8 +523,8 @@ class _Block(torch.autograd.Function):
         products.add(node[2:], low[None])
         products.add(node[:2], kept_node.hidden[1:, :rows])
         own, *rest = products.sums().split([3, 2, 2, 2])
-        edge_weights = own.transpose(0, 1).reshape(latent, 3 * latent), *rest[0].flip(0)
-        node_weights = rest[1].transpose(0, 1).reshape(latent, 2 * latent), *rest[2].flip(0)
+        edge_weights = own.transpose(0, 1).reshape(latent, 3 * latent), rest[0][1], rest[0][0]
+        node_weights = rest[1].transpose(0, 1).reshape(latent, 2 * latent), rest[2][1], rest[2][0]
         return None, None, None, None, None, None, grad_own, grad_e, *_each(edge_weights, edge_vectors), *_each(node_weights, node_vectors)
 
 
