@@ -262,7 +262,7 @@ def ablation(rows: Sequence[dict], axes: dict[str, dict[str, str | float]], path
 def generalisation(rows: Sequence[dict], over: str, trained: dict[str, Sequence[tuple[float, float]]], path: str | Path) -> None:
     """Rollout error beyond the training, a column a learned contender: above as it is, below over that of the trajectory's best trivial baseline.
     A dot a rollout; a bar the median of a scene, or of what lies between the ends of what was trained on, which is shaded; a cross at the top a
-    rollout that failed.
+    rollout that failed. Over particles, where scenes may lie above each other, every scene has a marker.
 
     rows: of one scene or several; over: as in ``learn.generalisation``; trained: contender -> [low, high] of ``over``, where known."""
     scenes = list(dict.fromkeys(row["scene"] for row in rows))
@@ -271,15 +271,19 @@ def generalisation(rows: Sequence[dict], over: str, trained: dict[str, Sequence[
         size = (1.5 + 5.2 * len(models), 6.4)
         figure, panels = plt.subplots(2, len(models), figsize=size, sharex=True, sharey="row", squeeze=False, layout="constrained")
         notes = []
+        several = over == PARTICLES and len(scenes) > 1
+        shapes = {scene: _SCENE_MARKERS[index % len(_SCENE_MARKERS)] for index, scene in enumerate(scenes)} if several else {}
         for (above, below), model in zip(panels.T, models, strict=True):
             found = trials(rows, model, over)
             ranges = trained.get(model, ())
-            for panel, key in ((above, "error"), (below, "ratio")):
+            for panel in (above, below):
                 panel.set(yscale="log", xscale="log" if over == PARTICLES else "linear")
                 for low, high in ranges:
                     panel.axvspan(low, high, color=COLOURS["oracle"], alpha=0.13, lw=0, zorder=0)
-                _dots(panel, found, key, COLOURS["learned"], MARKERS["learned"])
-            _dots(above, found, "trivial", COLOURS["trivial"], MARKERS["trivial"])
+            for panel, key, kind in ((above, "trivial", "trivial"), (above, "error", "learned"), (below, "ratio", "learned")):
+                for scene in scenes:
+                    members = [trial for trial in found if trial.scene == scene]
+                    _dots(panel, members, key, COLOURS[kind], shapes.get(scene, MARKERS[kind]))
             floors = [trial for trial in found if trial.floor]
             lowest = min([trial.error for trial in found if trial.error > 0], default=0.0)
             if floors and max(trial.floor for trial in floors) > lowest / 10:
@@ -299,16 +303,22 @@ def generalisation(rows: Sequence[dict], over: str, trained: dict[str, Sequence[
         panels[0, 0].set_ylabel("rollout MSE, length\u00b2")
         panels[1, 0].set_ylabel("over the best trivial baseline's")
         handles = [
-            plt.Line2D([], [], color=COLOURS[kind], marker=MARKERS[kind], ls="", label=label)
+            plt.Line2D([], [], color=COLOURS[kind], marker="s" if several else MARKERS[kind], ls="", label=label)
             for kind, label in (("learned", "learned, a rollout"), ("trivial", "best trivial baseline of the trajectory"))
         ]
+        for scene, marker in shapes.items():
+            handles.append(plt.Line2D([], [], color="#444444", marker=marker, markerfacecolor="none", ls="", label=scene))
         handles.append(plt.Line2D([], [], color="#444444", lw=2.4, label="median"))
         if any(trained.values()):
             handles.append(plt.Rectangle((0, 0), 1, 1, color=COLOURS["oracle"], alpha=0.25, lw=0, label="trained on"))
-        figure.legend(handles=handles, loc="outside upper center", ncols=2)
+        figure.legend(handles=handles, loc="outside upper center", ncols=3 if several else 2)
         if notes:
             figure.supxlabel("\n".join(notes), fontsize=8.5, color="#555555", wrap=True)
         _save(figure, path)
+
+
+#: One a scene, where several share an axis.
+_SCENE_MARKERS = ("s", "o", "^", "D", "v", "P")
 
 
 def _ends(values: Sequence[float], over: str) -> tuple[float, float]:

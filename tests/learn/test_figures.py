@@ -80,9 +80,11 @@ def test_generalisation_shows_every_rollout_medians_and_what_was_trained_on(tmp_
     def lines(panel, marker):
         return [list(zip(*line.get_data(), strict=True)) for line in panel.lines if line.get_marker() == marker]
 
-    assert lines(above, "s") == [[(500, 1e-4), (501, 2e-4), (502, 3e-4), (2500, 4e-3), (2502, 6e-3)]]
-    assert [point for point, _ in lines(above, "X")[0]] == [500, 501, 502, 2500, 2501, 2502]
-    assert np.allclose([ratio for _, ratio in lines(below, "s")[0]], [0.01, 0.02, 0.03, 2, 3])
+    # A marker a scene; the baseline's first, in grey.
+    assert lines(above, "s") == [[(500, 1e-2), (501, 1e-2), (502, 1e-2)], [(500, 1e-4), (501, 2e-4), (502, 3e-4)]]
+    assert lines(above, "o") == [[(2500, 2e-3), (2501, 2e-3), (2502, 2e-3)], [(2500, 4e-3), (2502, 6e-3)]]
+    assert [ratio for _, ratio in lines(below, "s")[0] + lines(below, "o")[0]] == pytest.approx([0.01, 0.02, 0.03, 2, 3])
+    assert {"small", "large", "trained on"} <= {text.get_text() for text in kept[0].legends[0].get_texts()}
     assert [[x for x, _ in crosses] for crosses in lines(above, "x")] == [[2501]] == [[x for x, _ in crosses] for crosses in lines(below, "x")]
     # Bars: medians, a failure being infinitely bad, just beyond their particles; the line at 1 is a baseline's.
     bars = [(line.get_ydata()[0], *line.get_xdata()) for line in above.lines if line.get_linewidth() == 2.4 and line.get_color() == "#D55E00"]
