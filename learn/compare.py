@@ -29,6 +29,8 @@ from sim.trajectory import Trajectory
 SOLVERS = ("solver", "reference")
 #: Kinds that restart only from a scene, not from positions.
 _FROM_SCENE = (*SOLVERS, "floor")
+#: What errors may be set over (``learn.generalisation``), besides the numbers that a scene's ``context`` names.
+PARTICLES, SCENE = "particles", "scene"
 
 
 @dataclass(frozen=True)

@@ -22,8 +22,8 @@ from matplotlib.axes import Axes  # noqa: E402
 from matplotlib.colors import to_rgb  # noqa: E402
 from matplotlib.figure import Figure  # noqa: E402
 
-from learn.compare import MOVING_MSE, Yardstick, pareto_front  # noqa: E402
-from learn.generalisation import PARTICLES, SCENE, Trial, groups, trials  # noqa: E402
+from learn.compare import MOVING_MSE, PARTICLES, SCENE, Yardstick, pareto_front  # noqa: E402
+from learn.generalisation import Trial, groups, trials  # noqa: E402
 from sim.errors import InputError  # noqa: E402
 from sim.trajectory import atomic_path  # noqa: E402
 

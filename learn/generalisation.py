@@ -12,10 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from learn.compare import MOVING_MSE, Yardstick
-
-#: What errors may be set over, besides the numbers that a scene's ``context`` names.
-PARTICLES, SCENE = "particles", "scene"
+from learn.compare import MOVING_MSE, PARTICLES, SCENE, Yardstick
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from learn.compare import Target, Yardstick, analyse, verdict
-from learn.generalisation import PARTICLES, SCENE, groups, trials
+from learn.compare import PARTICLES, SCENE, Target, Yardstick, analyse, verdict
+from learn.generalisation import groups, trials
 from learn.report import Asset, SceneAssets, number
 from sim.scene import SceneFamily
 from workflow.rows import timed_rows

@@ -17,8 +17,7 @@ from pathlib import Path
 from jsonschema import Draft202012Validator
 from jsonschema.exceptions import ValidationError, relevance
 
-from learn.compare import BEST_TRIVIAL
-from learn.generalisation import PARTICLES, SCENE
+from learn.compare import BEST_TRIVIAL, PARTICLES, SCENE
 from learn.metrics import CLOUD_METRICS, CLOUD_TIMES
 from learn.variants import with_variant
 from sim.errors import InputError

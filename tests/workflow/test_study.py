@@ -257,6 +257,7 @@ EDITS = [
     ("learn/train.py", None, LEARNED),
     ("learn/compare.py", None, COMPARED | {"report"}),
     ("learn/report_template.html", None, {"report"}),
+    ("learn/generalisation.py", None, {"report"}),
     ("learn/figures.py", None, set()),
     ("sim/render.py", None, set()),
     ("sim/cli.py", None, set()),
