@@ -34,9 +34,11 @@ from triton.tools.tensor_descriptor import TensorDescriptor
 if TYPE_CHECKING:
     from learn.gns import MLP, Network
 
-#: Rows a program takes, and its warps: what leaves all layers in registers (of Hopper, at latent 128). Backward's divide forward's.
-FORWARD = {"encoder": (64, 4), "edge": (64, 4), "node": (32, 8)}
-BACKWARD = {"encoder": (64, 4), "edge": (32, 4), "node": (32, 8)}
+#: Rows a program takes, and its warps: what leaves all layers in registers (of Hopper, at latent 128). Backward's divide forward's. Encoders stay
+#: below 64 rows: from there on Triton (3.6) multiplies by warp groups, and does so with an encoder's 16 inputs through addresses that are not
+#: always its own (found by compute-sanitizer).
+FORWARD = {"encoder": (32, 4), "edge": (64, 4), "node": (32, 8)}
+BACKWARD = {"encoder": (32, 4), "edge": (32, 4), "node": (32, 8)}
 #: Parts that a weight's gradient is summed in.
 PARTS = 32
 #: Edges a graph has room for are a multiple of this.
