@@ -331,6 +331,12 @@ class GNS(nn.Module):
 
         return fused.supports(self.network)
 
+    def training_replay(self, *arguments) -> TrainingReplay:
+        """``learn.replay.TrainingReplay`` of this model, where it is ``replayable``."""
+        from learn.replay import TrainingReplay
+
+        return TrainingReplay(self, *arguments)
+
     def calls(self, progress: float) -> int:
         """Model calls the loss is unrolled over at this share of the training."""
         unroll = self.options.unroll

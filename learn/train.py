@@ -23,7 +23,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, NoReturn
+from typing import Any, Literal, NoReturn
 
 import numpy as np
 import torch
@@ -42,9 +42,6 @@ from sim import __version__, periodic
 from sim.errors import InputError, RunError
 from sim.simulator import rollout, start_from
 from sim.trajectory import KINEMATIC_TYPE, Trajectory, write_json, write_text
-
-if TYPE_CHECKING:
-    from learn.replay import TrainingReplay
 
 LOG_COLUMNS = ("step", "seconds", "loss", "learning_rate", "gradient_norm", "window")
 VALIDATION_COLUMNS = ("step", "seconds", "rollout_mse", "spacing_ratio", "finished", "best")
@@ -312,7 +309,7 @@ class Trainer:
         self._rolling = False
         alone = self.processes.size == 1 and self.settings.edges is None and self.settings.optimizer == "adam"
         self.replayed = alone and getattr(self.model, "replayable", False)
-        self._replay: TrainingReplay | None = None
+        self._replay: Any = None  # ``learn.replay.TrainingReplay``, by the model: who trains a grid emulator does not depend on it
 
     # -- set-up --------------------------------------------------------------------------------------------------------------
 
@@ -475,7 +472,9 @@ class Trainer:
         if self.replayed:
             if self._replay is None or self._replay.frames != frames:
                 self._settle()
-                self._replay = self._replay_of(windows)
+                rows = self.settings.batch * max(shape[1] for shape in self.train_data.shapes)
+                clip = self.settings.gradient_clip or math.inf
+                self._replay = self.model.training_replay(self.parameters, self.optimizer, self.average, clip, windows, rows)
             self._replay.step(windows, self.generator, rate, self._decay())
         else:
             self._step(windows.to(self.device), rate, progress)
@@ -512,13 +511,6 @@ class Trainer:
             f"{self.folder}: step {self.step}: {what}: training diverged; {kept}; "
             f"start again with a smaller training.learning_rate (now {self.settings.learning_rate:g})"
         )
-
-    def _replay_of(self, windows: Windows) -> TrainingReplay:
-        from learn.replay import TrainingReplay  # not above: it needs Triton
-
-        rows = self.settings.batch * max(shape[1] for shape in self.train_data.shapes)
-        clip = self.settings.gradient_clip or math.inf
-        return TrainingReplay(self.model, self.parameters, self.optimizer, self.average, clip, windows, rows)
 
     def _settle(self) -> None:
         """Learn what became of replayed steps."""
