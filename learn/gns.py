@@ -37,6 +37,7 @@ from sim.trajectory import KINEMATIC_TYPE
 if TYPE_CHECKING:
     from learn.dataset import DataSpec, Windows
     from learn.fused import PaddedGraph, Search, Shadow
+    from learn.replay import TrainingReplay
 
 #: Added to the variance by every LayerNorm (torch's default).
 NORM_EPSILON = 1e-5
