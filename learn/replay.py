@@ -12,7 +12,8 @@ particles are filled up by rows that count for nothing, and a step whose edges e
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -59,6 +60,16 @@ def _searching(model: GNS, bounds: np.ndarray, examples: int, capacity: int) -> 
     return Search(bounds, model.radius, examples, capacity, model.options.self_edges, model.features.bounds.device)
 
 
+@contextmanager
+def _using(model: GNS, search: Search, shadow: Shadow) -> Iterator[None]:
+    # For one step, not for good: validation rolls out between two steps of a training, whose graph goes on reading its own shadow.
+    model.search, model.network.shadow = search, shadow
+    try:
+        yield
+    finally:
+        model.search = model.network.shadow = None
+
+
 class RolloutReplay:
     """Steps of the rollouts ``which`` together. ``compute`` predicts, ``accept`` makes that the present."""
 
@@ -83,20 +94,17 @@ class RolloutReplay:
                 state.first_edges = max(radius_graph(state.position[-1], model.radius, None, model.options.self_edges).edges, len(state.kinds))
             first += state.first_edges
         self.search = _searching(model, states[0].start.bounds, len(counts), math.ceil(model.options.edge_cap * first) + 1)
-        model.network.shadow = Shadow(model.network)
-        model.network.shadow.refresh()
+        self.shadow = Shadow(model.network)
+        self.shadow.refresh()
         self.replay = Replay(device, self._step, lambda: None)
 
     def _step(self) -> None:
         model, position = self.model, self.position
-        model.search = self.search
-        try:
+        with _using(model, self.search, self.shadow):
             context = None if self.context is None else self.context[self.example]
             graph = self.search(position[-1], self.example, self.present)
             output = model._predict(position, graph, self.kinds, self.bounds, context)
             acceleration = model.features.acceleration(output, position, self.bounds)
-        finally:
-            model.search = None
         frames = []
         for state, known, a, b in zip(self.states, self.known, self.ends[:-1], self.ends[1:], strict=True):
             own = position[:, a:b]
@@ -164,7 +172,7 @@ class TrainingReplay:
         self._none = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64, device=self.device)
         self._copied = [torch.cuda.Event() for _ in range(2)] if self.device.type == "cuda" else None
         self._turn, self._still = 0, False
-        model.network.shadow = Shadow(model.network)
+        self.shadow = Shadow(model.network)
         self._begin()
 
     def _begin(self) -> None:
@@ -182,16 +190,13 @@ class TrainingReplay:
 
     def _step(self) -> None:
         model = self.model
-        model.network.shadow.refresh()
-        model.search = self.search
-        try:
+        self.shadow.refresh()
+        with _using(model, self.search, self.shadow):
             windows = Windows(self.position, self.kinds, self.example, self.context, counted=self.counted)
             for parameter in self.parameters:
                 parameter.grad = None
             loss = model.loss_under(self.noise, windows)
             loss.backward()
-        finally:
-            model.search = None
         norm = nn.utils.clip_grad_norm_(self.parameters, self.clip)
         good = loss.isfinite() & norm.isfinite() & (self.search.most <= self.search.capacity) & (self.numbers[2] == 0)
         parts = torch.stack([loss.detach(), norm, torch.zeros_like(norm)]).double()

@@ -209,7 +209,27 @@ def test_replayed_rollouts_are_rollouts(stride, monkeypatch):
     for own, other in zip(found, wanted, strict=True):
         assert own.status == other.status == "ok"
         np.testing.assert_allclose(own.position, other.position, rtol=0, atol=2e-6)
-    assert model.search is None and isinstance(model._replay, RolloutReplay)
+    assert model.search is model.network.shadow is None and isinstance(model._replay, RolloutReplay)
+
+
+def test_rollouts_between_training_steps_leave_them_alone(replaying):
+    """As validation does: the training goes on, makes room anew, and ends at the weights that it has without rollouts."""
+    spec, found = spec_of(), []
+    torch.manual_seed(0)
+    first, good = build("gns", SETTINGS, spec), batch(4, (8, 8), 0)
+    for validated in (False, True):
+        model = copy.deepcopy(first)
+        parameters, generator = list(model.parameters()), torch.Generator().manual_seed(7)
+        average = {name: value.clone() for name, value in model.state_dict().items()}
+        replay = TrainingReplay(model, parameters, Adam(parameters, 0.0), average, 1.0, good, 16)
+        for _ in range(2):
+            replay.step(good, generator, 1e-2, 0.5)
+            if validated:
+                assert rollout(model, start_of(spec, 2, 12), 2).status == "ok"
+        assert replay.settle()[2:] == (0, 0)
+        found.append(model.state_dict())
+    for name, value in found[0].items():
+        assert torch.equal(found[1][name], value)
 
 
 def test_what_clumps_ends_and_the_others_go_on(replaying):
