@@ -32,27 +32,30 @@ ROOM = 1.25
 
 
 class Replay:
-    """``function`` of tensors that stay, captured at the first call; ``prepare`` is called before it is warmed up and again after."""
+    """A function of tensors that stay, captured at the first call; ``prepare`` is called before it is warmed up and again after.
 
-    def __init__(self, device: torch.device, function: Callable[[], None], prepare: Callable[[], None]):
-        self.device, self.function, self.prepare, self.graph = device, function, prepare, None
+    It keeps neither: an owner that its own graph refers to, and with it the graph's memory, would wait for the garbage collector.
+    """
 
-    def __call__(self) -> None:
+    def __init__(self, device: torch.device):
+        self.device, self.graph = device, None
+
+    def __call__(self, function: Callable[[], None], prepare: Callable[[], None] = lambda: None) -> None:
         if self.device.type != "cuda":
-            self.function()
+            function()
             return
         if self.graph is None:
-            self.prepare()
+            prepare()
             stream = torch.cuda.Stream(self.device)
             stream.wait_stream(torch.cuda.current_stream())
             with torch.cuda.stream(stream):
-                self.function()  # compiles kernels, which a capture must not
-                self.function()
+                function()  # compiles kernels, which a capture must not
+                function()
             torch.cuda.current_stream().wait_stream(stream)
-            self.prepare()
+            prepare()
             self.graph = torch.cuda.CUDAGraph()
             with torch.cuda.graph(self.graph):
-                self.function()
+                function()
         self.graph.replay()
 
 
@@ -96,7 +99,7 @@ class RolloutReplay:
         self.search = _searching(model, states[0].start.bounds, len(counts), math.ceil(model.options.edge_cap * first) + 1)
         self.shadow = Shadow(model.network)
         self.shadow.refresh()
-        self.replay = Replay(device, self._step, lambda: None)
+        self.replay = Replay(device)
 
     def _step(self) -> None:
         model, position = self.model, self.position
@@ -122,7 +125,7 @@ class RolloutReplay:
                 known.copy_(state.known(self.model.spec.stride))
         if self.context is not None:
             self.context.copy_(torch.from_numpy(np.stack([state.context for state in self.states])))
-        self.replay()
+        self.replay(self._step)
         frames, found = self.frames.float().cpu().numpy(), self.found.tolist()
         edges = np.diff(found[:-1]).tolist()
         if found[-1] > self.search.capacity:
@@ -177,7 +180,7 @@ class TrainingReplay:
 
     def _begin(self) -> None:
         self.search = _searching(self.model, np.asarray(self.model.spec.bounds), self.examples, self.capacity)
-        self.replay = Replay(self.device, self._step, self._prepare)
+        self.replay = Replay(self.device)
 
     def _prepare(self) -> None:
         """Warming up must not train."""
@@ -231,7 +234,7 @@ class TrainingReplay:
             getattr(self, name).copy_(getattr(self, f"_{name}")[turn], non_blocking=True)
         if self._copied:
             self._copied[turn].record()
-        self.replay()
+        self.replay(self._step, self._prepare)
 
     def settle(self) -> tuple[float, float, int, int]:
         """Since the last time: sums of losses and of gradient norms, steps that were none for a number that is not finite, and for want of room

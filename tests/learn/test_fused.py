@@ -8,6 +8,8 @@ import os
 os.environ["TRITON_INTERPRET"] = "1"  # read where the kernels are defined
 
 import copy
+import gc
+import weakref
 
 import numpy as np
 import pytest
@@ -230,6 +232,24 @@ def test_rollouts_between_training_steps_leave_them_alone(replaying):
         found.append(model.state_dict())
     for name, value in found[0].items():
         assert torch.equal(found[1][name], value)
+
+
+def test_what_replays_is_freed_with_its_last_user(replaying):
+    """Without the garbage collector: on a GPU it holds a graph's memory, and a validation makes several."""
+    model = build("gns", SETTINGS, spec_of())
+    parameters, good = list(model.parameters()), batch(4, (8, 8), 0)
+    training = TrainingReplay(model, parameters, Adam(parameters, 0.0), model.state_dict(), 1.0, good, 16)
+    gc.collect()
+    gc.disable()
+    try:
+        training.step(good, torch.Generator(), 1e-2, 0.5)
+        rollout(model, start_of(model.spec, 2, 12), 2)
+        users = weakref.ref(training), weakref.ref(model._replay)
+        model.begin(start_of(model.spec, 2, 12))
+        del training
+        assert [user() for user in users] == [None, None]
+    finally:
+        gc.enable()
 
 
 def test_what_clumps_ends_and_the_others_go_on(replaying):
