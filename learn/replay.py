@@ -171,8 +171,9 @@ class TrainingReplay:
         self.counted, self._counted = pair(rows, dtype=torch.bool)
         self.context, self._context = pair(*first.context.shape) if first.context is not None else (None, (None, None))
         self.numbers, self._numbers = pair(3)  # learning rate, decay of the average, 1 where nothing is to change
-        self.totals = torch.zeros(3, dtype=torch.float64, device=self.device)  # losses, gradient norms, steps that were none
-        self._none = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64, device=self.device)
+        # Losses, gradient norms, steps with a number that is not finite, steps without room; and the edges of the largest graph.
+        self.totals = torch.zeros(4, dtype=torch.float64, device=self.device)
+        self.most = torch.zeros((), dtype=torch.int64, device=self.device)
         self._copied = [torch.cuda.Event() for _ in range(2)] if self.device.type == "cuda" else None
         self._turn, self._still = 0, False
         self.shadow = Shadow(model.network)
@@ -189,11 +190,12 @@ class TrainingReplay:
         for parameter in self.parameters:
             parameter.grad = None
         self.totals.zero_()
-        self.search.most.zero_()
+        self.most.zero_()
 
     def _step(self) -> None:
         model = self.model
         self.shadow.refresh()
+        self.search.most.zero_()  # of this step's graphs alone: the next ones may have room
         with _using(model, self.search, self.shadow):
             windows = Windows(self.position, self.kinds, self.example, self.context, counted=self.counted)
             for parameter in self.parameters:
@@ -201,9 +203,10 @@ class TrainingReplay:
             loss = model.loss_under(self.noise, windows)
             loss.backward()
         norm = nn.utils.clip_grad_norm_(self.parameters, self.clip)
-        good = loss.isfinite() & norm.isfinite() & (self.search.most <= self.search.capacity) & (self.numbers[2] == 0)
-        parts = torch.stack([loss.detach(), norm, torch.zeros_like(norm)]).double()
-        self.totals += torch.where(good, parts, self._none)
+        room, finite = self.search.most <= self.search.capacity, loss.isfinite() & norm.isfinite()
+        good = room & finite & (self.numbers[2] == 0)
+        self.totals += torch.stack([torch.where(good, loss.detach(), 0), torch.where(good, norm, 0), room & ~finite, ~room])
+        torch.maximum(self.most, self.search.most, out=self.most)
         self.optimizer.step(self.numbers[0], found_inf=1 - good.float())
         own = model.state_dict()
         names = [name for name, value in own.items() if value.is_floating_point()]
@@ -239,11 +242,10 @@ class TrainingReplay:
     def settle(self) -> tuple[float, float, int, int]:
         """Since the last time: sums of losses and of gradient norms, steps that were none for a number that is not finite, and for want of room
         (there is more afterwards). Waits for the device."""
-        loss, norm, none = self.totals.tolist()
+        loss, norm, bad, full = self.totals.tolist()
         self.totals.zero_()
-        most = int(self.search.most)
-        if most <= self.search.capacity:
-            return loss, norm, int(none), 0
-        self.capacity = math.ceil(ROOM * most)
-        self._begin()
-        return loss, norm, 0, int(none)
+        if full:
+            self.capacity = math.ceil(ROOM * int(self.most))
+            self._begin()
+        self.most.zero_()
+        return loss, norm, int(bad), int(full)

@@ -172,15 +172,30 @@ def test_a_step_that_is_none_changes_nothing_and_is_told():
     before = copy.deepcopy(model.state_dict())
     replay.step(bad, torch.Generator(), 1e-2, 0.5)
     assert replay.settle()[2:] == (1, 0)
-    replay.search.most += replay.search.capacity + 1  # as if a batch had been denser
-    replay.step(good, torch.Generator(), 1e-2, 0.5)
-    capacity = replay.search.capacity
-    assert replay.settle()[2:] == (0, 1) and replay.search.capacity > capacity
+    dense, capacity = batch(4, (8, 8), 0), replay.search.capacity
+    dense.position[:] = 0.5
+    dense.example[:] = 0  # 256 edges
+    assert capacity < 256
+    replay.step(dense, torch.Generator(), 1e-2, 0.5)
+    replay.step(bad, torch.Generator(), 1e-2, 0.5)
+    assert replay.settle()[2:] == (1, 1) and replay.search.capacity > 256
     for name, value in model.state_dict().items():
         assert torch.equal(value, before[name]) and torch.equal(average[name], before[name])
     assert all(int(step) == 0 for step in optimizer.steps)
     replay.step(good, torch.Generator(), 1e-2, 0.5)
     assert replay.settle()[2:] == (0, 0) and not torch.equal(next(model.parameters()), next(iter(before.values())))
+
+
+def test_a_dense_batch_costs_its_own_step_alone():
+    model = build("gns", SETTINGS, spec_of())
+    parameters, good = list(model.parameters()), batch(4, (8, 8), 0)
+    replay = TrainingReplay(model, parameters, Adam(parameters, 0.0), model.state_dict(), 1.0, good, 16)
+    dense = batch(4, (8, 8), 0)
+    dense.position[:], dense.example[:] = 0.5, 0
+    for windows in (dense, good, good):
+        replay.step(windows, torch.Generator(), 1e-2, 0.5)
+    loss, norm, *none = replay.settle()
+    assert none == [0, 1] and loss > 0 and norm > 0 and int(replay.optimizer.steps[0]) == 2
 
 
 def start_of(spec: DataSpec, seed: int, particles: int, kinds: tuple[int, ...] = (5,), context: int = 0) -> Start:
