@@ -157,7 +157,8 @@ class TrainingReplay:
         self.device, self.rows, self.frames = model.features.bounds.device, -(-rows // 64) * 64, len(first.position)
         self.examples, (_, particles, dim) = first.examples, first.position.shape
         graph = radius_graph(first.position[model.velocities], model.radius, first.example, model.options.self_edges)
-        self.capacity, rows = math.ceil(ROOM * graph.edges * rows / particles), self.rows
+        edges = max(graph.edges, particles)  # without self edges there may be none at first
+        self.capacity, rows = math.ceil(ROOM * edges * rows / particles), self.rows
 
         def pair(*shape: int, dtype: torch.dtype = torch.float32) -> tuple[Tensor, tuple[Tensor, Tensor]]:
             # Written by the host while the device still reads the one before.

@@ -162,6 +162,16 @@ def test_replayed_training_is_training(changes, settings, kinds, context):
         torch.testing.assert_close(fast_average[name], average[name], rtol=1e-3, atol=2e-5)
 
 
+def test_a_batch_without_edges_trains():
+    model = build("gns", SETTINGS | {"self_edges": False}, spec_of(radius=1e-4))
+    parameters, apart = list(model.parameters()), batch(4, (8, 8), 0)
+    wanted = model.loss(apart, torch.Generator().manual_seed(7), 0.0).item()
+    replay = TrainingReplay(model, parameters, Adam(parameters, 0.0), model.state_dict(), 1.0, apart, 16)
+    replay.step(apart, torch.Generator().manual_seed(7), 1e-2, 0.5)
+    loss, _, *none = replay.settle()
+    assert none == [0, 0] and loss == pytest.approx(wanted, rel=1e-4)
+
+
 def test_a_step_that_is_none_changes_nothing_and_is_told():
     model = build("gns", SETTINGS, spec_of())
     parameters = list(model.parameters())
