@@ -139,7 +139,7 @@ class Windows:
 
     position [frames, total, dim] float32; particle_type [total] int64; example [total] int64: which window a particle is of, ascending
     from 0; context [frames, examples, c] float32 or None. place: of a batch that several processes share, how many particles come before these, and
-    how many there are in all.
+    how many there are in all. counted [total] bool: particles there are, where the rest of the rows fill up a fixed shape (``learn.replay``).
     """
 
     position: torch.Tensor
