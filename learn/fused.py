@@ -56,8 +56,8 @@ LATENTS = (16, 32, 64, 128)
 class PaddedGraph:
     """``learn.graph.Graph`` with room for ``capacity`` edges, all on the device; senders of one receiver are in no order.
 
-    sender, receiver [capacity] int32 (0 beyond the last edge); offsets [particles + 1] int32, none above the capacity; found [] int64:
-    the number of edges there should be.
+    sender, receiver [capacity] int32 (0 beyond the last edge); offsets [particles + 1] int32, none above the capacity; found
+    [particles + 1] int64: what they would be with room for all.
     """
 
     sender: Tensor
@@ -212,7 +212,7 @@ class Search:
         torch.cumsum(counts, 0, out=offsets[1:])
         kernel(True)
         torch.maximum(self.most, offsets[-1], out=self.most)
-        return PaddedGraph(sender, receiver, offsets.clamp(max=self.capacity).int(), offsets[-1])
+        return PaddedGraph(sender, receiver, offsets.clamp(max=self.capacity).int(), offsets)
 
 
 # -- MLPs ---------------------------------------------------------------------------------------------------------------------

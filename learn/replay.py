@@ -116,7 +116,7 @@ class RolloutReplay:
         self.frames = torch.cat(frames, 1)
         self.following.copy_(torch.cat([position[1:], self.frames[-1:]]))
         # Counted before they are cut off at the capacity: a clump must not look smaller than it is.
-        self.found = torch.cat([graph.offsets[self.last], graph.found.view(1).int()])
+        self.found = graph.found[self.last]
 
     def compute(self) -> tuple[list[np.ndarray], list[int]]:
         """The next frames [stride, particles, dim] of each, and the edges that each has."""
@@ -126,11 +126,7 @@ class RolloutReplay:
         if self.context is not None:
             self.context.copy_(torch.from_numpy(np.stack([state.context for state in self.states])))
         self.replay(self._step)
-        frames, found = self.frames.float().cpu().numpy(), self.found.tolist()
-        edges = np.diff(found[:-1]).tolist()
-        if found[-1] > self.search.capacity:
-            edges = [radius_graph(self.position[-1, a:b], self.model.radius, None, self.model.options.self_edges).edges
-                     for a, b in zip(self.ends[:-1], self.ends[1:], strict=True)]  # fmt: skip
+        frames, edges = self.frames.float().cpu().numpy(), np.diff(self.found.tolist()).tolist()
         return [np.ascontiguousarray(frames[:, a:b]) for a, b in zip(self.ends[:-1], self.ends[1:], strict=True)], edges
 
     def accept(self) -> None:
