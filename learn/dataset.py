@@ -156,7 +156,8 @@ class Windows:
     def to(self, device: torch.device | str) -> Windows:
         """The same windows on ``device``."""
         context = None if self.context is None else self.context.to(device)
-        return Windows(self.position.to(device), self.particle_type.to(device), self.example.to(device), context, self.place)
+        counted = None if self.counted is None else self.counted.to(device)
+        return Windows(self.position.to(device), self.particle_type.to(device), self.example.to(device), context, self.place, counted)
 
 
 class _Moments:

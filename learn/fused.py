@@ -2,8 +2,8 @@
 
 A GNS in separate operations writes every layer of every edge to memory and reads it back, a few dozen passes over edges x latent a block. Here
 a program loads a tile of edges once, gathers what its particles contribute, goes through three layers and the LayerNorm in registers, and writes
-the new edges and the messages. Messages are summed along each receiver's
-run of edges, without atomics, so that a step is the same step every time.
+the new edges and the messages. Messages are summed along each receiver's run of edges, without atomics, so that a step is the same step every
+time (but for losses over several calls, whose gradient reaches the places of particles by PyTorch's atomic additions).
 
 Shapes are those of a capacity, never of the number of edges: what exceeds it is counted, and nobody but whoever reads that count waits
 for the device, so a step can be a CUDA graph (``learn.replay``).
@@ -326,7 +326,8 @@ def _segment_sum_kernel(values, order, offsets, out, LATENT: tl.constexpr, CHUNK
         live = row < last
         if ORDERED:
             row = tl.load(order + row, mask=live, other=0)
-        total += tl.sum(tl.load(values + row[:, None] * LATENT + j[None, :], mask=live[:, None], other=0.0).to(tl.float32), 0)
+        at_row = values + row.to(tl.int64)[:, None] * LATENT  # beyond 2^31 numbers in large graphs
+        total += tl.sum(tl.load(at_row + j[None, :], mask=live[:, None], other=0.0).to(tl.float32), 0)
     tl.store(out + i * LATENT + j, total.to(out.dtype.element_ty))
 
 

@@ -18,6 +18,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
@@ -325,12 +326,14 @@ class GNS(nn.Module):
 
     @property
     def replayable(self) -> bool:
-        """Whether steps of this model can be CUDA graphs of fused kernels (``learn.fused``, ``learn.replay``): in bf16, in a box with walls."""
-        if self.features.bounds.device.type != "cuda" or not self.network.low_precision or self.spec.periodic:
+        """Whether steps of this model can be CUDA graphs of fused kernels (``learn.fused``, ``learn.replay``): in bf16, in a box with walls, on a GPU
+        that they were written for (Hopper; on others they were never run)."""
+        device = self.features.bounds.device
+        if device.type != "cuda" or not self.network.low_precision or self.spec.periodic or find_spec("triton") is None:
             return False
         from learn import fused
 
-        return fused.supports(self.network)
+        return torch.cuda.get_device_capability(device) >= (9, 0) and fused.supports(self.network)
 
     def training_replay(self, *arguments) -> TrainingReplay:
         """``learn.replay.TrainingReplay`` of this model, where it is ``replayable``."""

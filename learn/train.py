@@ -472,6 +472,7 @@ class Trainer:
         if self.replayed:
             if self._replay is None or self._replay.frames != frames:
                 self._settle()
+                self._replay = None  # before the next one takes as much memory
                 rows = self.settings.batch * max(shape[1] for shape in self.train_data.shapes)
                 clip = self.settings.gradient_clip or math.inf
                 self._replay = self.model.training_replay(self.parameters, self.optimizer, self.average, clip, windows, rows)
@@ -481,7 +482,9 @@ class Trainer:
         state["step"] += 1
         if self.processes.leads and self.step % self.settings.log_every == 0:
             self._settle()
-            count = max(state["logged"], 1)
+            count = state["logged"]
+            if count == 0:  # all were skipped
+                return
             mean = state["loss_sum"] / count
             if self.board:
                 self.board.add_scalar("loss", mean, self.step)
