@@ -84,7 +84,7 @@ class RolloutReplay:
         self.last = torch.from_numpy(self.ends).to(device)
         self.kinds = torch.cat([state.kinds for state in self.states])
         self.example = torch.repeat_interleave(torch.arange(len(counts), device=device), torch.tensor(counts, device=device))
-        self.present = torch.tensor([len(self.kinds)], dtype=torch.int32, device=device)
+        self.particles = torch.tensor([len(self.kinds)], dtype=torch.int32, device=device)
         self.position = torch.cat([state.position for state in self.states], 1)
         self.following = self.position.clone()
         self.known = [state.known(model.spec.stride) for state in self.states]
@@ -105,7 +105,7 @@ class RolloutReplay:
         model, position = self.model, self.position
         with _using(model, self.search, self.shadow):
             context = None if self.context is None else self.context[self.example]
-            graph = self.search(position[-1], self.example, self.present)
+            graph = self.search(position[-1], self.example, self.particles)
             output = model._predict(position, graph, self.kinds, self.bounds, context)
             acceleration = model.features.acceleration(output, position, self.bounds)
         frames = []
