@@ -1,8 +1,8 @@
-"""Rollout and training steps of the GNS against its textbook form, one core, interleaved in one run: ``python benchmarks/gns.py``.
+"""Rollout and training steps of the GNS against its textbook form on one core, and on two, interleaved in one run: ``python benchmarks/gns.py``.
 
 The textbook form (``tests/learn/textbook_gns.py``: concatenate, index_add, autograd, float32) has the same parameters and the same graph.
 A rollout step is graph, features, network and update; a training step is ``loss`` and ``backward``. Times are medians over interleaved
-repetitions, wall and CPU seconds of the one thread (on a shared machine the CPU time is the steadier); errors are relative, 2-norm,
+repetitions, wall and CPU seconds of the main thread (of one core the CPU time is the steadier on a shared machine); errors are relative, 2-norm,
 against the textbook form in float64. ``bf16_units`` says whether the processor multiplies bfloat16 in hardware: without, bf16 is emulated.
 """
 
@@ -28,8 +28,8 @@ from sim.trajectory import write_json
 
 ROOT = Path(__file__).resolve().parent.parent
 
-#: name -> latent, blocks of message passing.
-SIZES = {"full": (128, 10), "demo": (64, 5)}
+#: name -> latent, blocks of message passing, particles, dimension.
+SIZES = {"full": (128, 10, 1000, 2), "demo": (64, 5, 1000, 2), "3d": (128, 10, 5000, 3)}
 RADIUS = 0.035
 #: About 15 neighbours in 2D, 30 in 3D.
 SPACING = {2: 0.0158, 3: 0.0184}
@@ -109,10 +109,26 @@ def errors(model: GNS, windows: Windows, textbook: type[torch.nn.Module]) -> tup
     return tuple(float((a - b).norm() / b.norm()) for a, b in zip(found, wanted, strict=True))
 
 
-def measure(size: str, particles: int, repeats: int, precisions: list[str]) -> dict:
-    """One size: times of textbook and ours in every precision, speed-ups over the textbook form, errors against float64."""
-    latent, blocks = SIZES[size]
-    spec, windows, start = scene(particles)
+def steps(model: GNS, windows: Windows, start: Start, threads: int = 1) -> dict[str, Callable[[], object]]:
+    """A rollout's step and a training's, on so many threads."""
+
+    def roll():
+        torch.set_num_threads(threads)
+        model.begin(start)
+        return model.advance()
+
+    def train():
+        torch.set_num_threads(threads)
+        model.zero_grad(set_to_none=True)
+        model.loss(windows, torch.Generator().manual_seed(0), 0.0).backward()
+
+    return {"rollout_step": roll, "training_step": train}
+
+
+def measure(size: str, repeats: int, precisions: list[str]) -> dict:
+    """One size: times of textbook and ours in every precision, speed-ups over the textbook form, errors against float64; ours on two cores."""
+    latent, blocks, particles, dim = SIZES[size]
+    spec, windows, start = scene(particles, dim)
     models = {}
     for name in ["textbook", *precisions]:
         torch.manual_seed(0)
@@ -121,25 +137,16 @@ def measure(size: str, particles: int, repeats: int, precisions: list[str]) -> d
     models["textbook"].network = textbook(models["textbook"].network)
     error = {name: dict(zip(("output", "gradient"), errors(model, windows, textbook), strict=True)) for name, model in models.items()}
 
-    def roll(model: GNS) -> Callable[[], object]:
-        def step():
-            model.begin(start)
-            return model.advance()
-        return step
-
-    def train(model: GNS) -> Callable[[], object]:
-        def step():
-            model.zero_grad(set_to_none=True)
-            model.loss(windows, torch.Generator().manual_seed(0), 0.0).backward()
-        return step
-
     edges = radius_graph(windows.position[5], RADIUS).edges
-    result = {"latent": latent, "message_passing": blocks, "particles": particles, "edges": edges, "error": error}
-    for kind, make in (("rollout_step", roll), ("training_step", train)):
-        times = interleave({name: make(model) for name, model in models.items()}, repeats)
+    result = {"latent": latent, "message_passing": blocks, "particles": particles, "dim": dim, "edges": edges, "error": error}
+    for kind in ("rollout_step", "training_step"):
+        functions = {name: steps(model, windows, start)[kind] for name, model in models.items()}
+        functions |= {f"{name}, two cores": steps(models[name], windows, start, 2)[kind] for name in precisions}
+        times = interleave(functions, repeats)
         for name in precisions:
             times[name]["speed_up"] = times["textbook"]["wall_ms"] / times[name]["wall_ms"]
             times[name]["speed_up_cpu"] = times["textbook"]["cpu_ms"] / times[name]["cpu_ms"]
+            times[f"{name}, two cores"]["over_one_core"] = times[name]["wall_ms"] / times[f"{name}, two cores"]["wall_ms"]
         result[kind] = times
     return result
 
@@ -149,7 +156,6 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=ROOT / "benchmarks" / "results" / "gns.json")
     parser.add_argument("--sizes", nargs="+", choices=list(SIZES), default=list(SIZES))
     parser.add_argument("--precisions", nargs="+", choices=["f32", "bf16"], help="default: f32, and bf16 where the processor has units for it")
-    parser.add_argument("--particles", type=int, default=1000)
     parser.add_argument("--repeats", type=int, default=7)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
@@ -161,12 +167,14 @@ def main() -> None:
     }
     print(f"capability {results['capability']}, bf16 units: {', '.join(units) or 'none, so bf16 is emulated and left out unless asked for'}")
     for size in arguments.sizes:
-        found = results["sizes"][size] = measure(size, arguments.particles, arguments.repeats, precisions)
-        print(f"{size}: latent {found['latent']}, M {found['message_passing']}, {found['particles']} particles, {found['edges']} edges")
+        found = results["sizes"][size] = measure(size, arguments.repeats, precisions)
+        shape = f"{found['particles']} particles, {found['dim']}D, {found['edges']} edges"
+        print(f"{size}: latent {found['latent']}, M {found['message_passing']}, {shape}")
         for kind in ("rollout_step", "training_step"):
             for name, row in found[kind].items():
                 gain = f"  {row['speed_up']:.2f}x ({row['speed_up_cpu']:.2f}x by CPU time)" if "speed_up" in row else ""
-                print(f"  {kind:14} {name:9} {row['wall_ms']:8.1f} ms wall {row['cpu_ms']:8.1f} ms CPU{gain}")
+                gain = f"  {row['over_one_core']:.2f}x one core" if "over_one_core" in row else gain
+                print(f"  {kind:14} {name:15} {row['wall_ms']:8.1f} ms wall {row['cpu_ms']:8.1f} ms CPU{gain}")
         for name, row in found["error"].items():
             print(f"  {name}: relative error of the output {row['output']:.1e}, of the gradient {row['gradient']:.1e}")
     write_json(arguments.out, results)
