@@ -39,9 +39,9 @@ def test_shipped_checkpoint(checkpoint: Path) -> None:
     assert np.median(strayed) < model.spec.spacing / 2
 
 
-def flight(family: SceneFamily, seed: int, known: int, frames: int) -> tuple[Start, np.ndarray]:
-    """The first ``known`` frames of the first draw from ``seed`` on of one body that touches nothing for ``frames`` more, and where it is then."""
-    for seed in range(seed, seed + 1000):
+def flight(family: SceneFamily, first: int, known: int, frames: int) -> tuple[Start, np.ndarray]:
+    """The first ``known`` frames of the first draw from seed ``first`` on of one body that touches nothing for ``frames`` more, and where it is then."""
+    for seed in range(first, first + 1000):
         scene = family.sample(seed)
         if len(scene.bodies) > 1:
             continue
