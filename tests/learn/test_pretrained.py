@@ -40,7 +40,7 @@ def test_shipped_checkpoint(checkpoint: Path) -> None:
 
 
 def flight(family: SceneFamily, first: int, known: int, frames: int) -> tuple[Start, np.ndarray]:
-    """The first ``known`` frames of the first draw from seed ``first`` on of one body that touches nothing for ``frames`` more, and where it is then."""
+    """The first ``known`` frames of a draw (the first from seed ``first`` on) of one body that touches nothing for ``frames`` more; and its end."""
     for seed in range(first, first + 1000):
         scene = family.sample(seed)
         if len(scene.bodies) > 1:
