@@ -15,7 +15,9 @@ predictions start from       the mean acceleration                gravity dt^2 i
 neighbours                   128 at most                          all
 ===========================  ===================================  ==========================================================
 
-Outputs are equal to the rounding of float32, on graphs in which no particle has more than 128 neighbours.
+Outputs are equal to the rounding of float32, on graphs in which no particle has more than 128 neighbours. An angle of friction is the one
+number that the data differ in: the port's hold its tangent, ours degrees (data are converted, ``sim.importing``, ``sim.export``). No linear layer
+does that, so a model that sees it wants, on either side, what it was trained on.
 
 Decision: a state_dict does not say whether it was trained before or after the port's commit 3b8fb5c ("fix message passing", 11 December
 2024; its releases up to v1.1.1 are older), and the wrong guess moves particles wrongly without a word: so the reader must be told.
