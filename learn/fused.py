@@ -31,6 +31,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from triton.tools.tensor_descriptor import TensorDescriptor
 
+from learn.graph import Graph
+
 if TYPE_CHECKING:
     from learn.gns import MLP, Network
 
@@ -53,25 +55,14 @@ LATENTS = (16, 32, 64, 128)
 
 
 @dataclass(frozen=True)
-class PaddedGraph:
-    """``learn.graph.Graph`` with room for ``capacity`` edges, all on the device; senders of one receiver are in no order.
+class PaddedGraph(Graph):
+    """A ``Graph`` with room for more edges, all on the device; senders of one receiver are in no order.
 
-    sender, receiver [capacity] int32 (0 beyond the last edge); offsets [particles + 1] int32, none above the capacity; found
-    [particles + 1] int64: what they would be with room for all.
+    ``edges`` is what there is room for: sender, receiver are 0 beyond the last edge; offsets, none above the room; found [particles + 1] int64: what
+    they would be with room for all.
     """
 
-    sender: Tensor
-    receiver: Tensor
-    offsets: Tensor
     found: Tensor
-
-    @property
-    def edges(self) -> int:
-        return len(self.sender)
-
-    @property
-    def particles(self) -> int:
-        return len(self.offsets) - 1
 
     @cached_property
     def count(self) -> Tensor:
@@ -80,7 +71,7 @@ class PaddedGraph:
 
     @cached_property
     def reverse(self) -> Tensor:
-        """[capacity] int32: as in ``Graph``."""
+        """[edges] int32: as in ``Graph``, whose sorting wants senders in order."""
         found = torch.zeros_like(self.sender)
         block = 64
         _reverse_kernel[(triton.cdiv(self.edges, block),)](self.sender, self.receiver, self.offsets, self.count, found, BLOCK=block, CHUNK=16)

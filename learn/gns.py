@@ -37,7 +37,7 @@ from sim.trajectory import KINEMATIC_TYPE
 
 if TYPE_CHECKING:
     from learn.dataset import DataSpec, Windows
-    from learn.fused import PaddedGraph, Search, Shadow
+    from learn.fused import Search, Shadow
     from learn.replay import TrainingReplay
 
 #: Added to the variance by every LayerNorm (torch's default).
@@ -250,11 +250,11 @@ class Network(nn.Module):
         self.processor = nn.ModuleList(Interaction(latent, hidden, settings.edge_update) for _ in range(settings.message_passing // self.repeats))
         self.decode = MLP(latent, latent, hidden, dim, norm=False)
         self.low_precision = settings.precision == "bf16"
-        self.shadow: Shadow | None = None  # what fused kernels read
+        self.shadow: Shadow | None = None  # what fused kernels read, while it is they that run
 
-    def forward(self, nodes: Tensor, edges: Tensor, graph: Graph | PaddedGraph) -> Tensor:
+    def forward(self, nodes: Tensor, edges: Tensor, graph: Graph) -> Tensor:
         """nodes [particles, node_width], edges [edges, edge_width] -> [particles, dim]."""
-        if not isinstance(graph, Graph):
+        if self.shadow is not None:
             from learn import fused  # not above: Triton comes with CUDA builds of torch alone
 
             return fused.forward(self, nodes, edges, graph)
@@ -288,6 +288,10 @@ class _State:
         """[c]: of the present frame."""
         return self.start.context[min(self.present, len(self.start.context) - 1)]
 
+    def measure(self, edges: int) -> None:
+        """The edges of the first graph are what later ones are measured by; without self edges there may be none."""
+        self.first_edges = self.first_edges or max(edges, len(self.kinds))
+
     def known(self, stride: int) -> Tensor | None:
         """[stride, k, dim]: where the kinematic particles are in the next frames."""
         if self.fixed is None:
@@ -319,7 +323,7 @@ class GNS(nn.Module):
         self.network = Network(settings, self.features.node_width, self.features.edge_width, spec.dim)
         self.search: Search | None = None  # of graphs on the device, where steps are replayed
 
-    def _graph(self, position: Tensor, example: Tensor | None, period: np.ndarray | None, present: Tensor | None = None) -> Graph | PaddedGraph:
+    def _graph(self, position: Tensor, example: Tensor | None, period: np.ndarray | None, present: Tensor | None = None) -> Graph:
         if self.search is not None:
             return self.search(position, example, present)
         return radius_graph(position, self.radius, example, self.options.self_edges, period)
@@ -391,7 +395,7 @@ class GNS(nn.Module):
         return total / calls
 
     def _predict(
-        self, position: Tensor, graph: Graph | PaddedGraph, particle_type: Tensor, bounds: Tensor, context: Tensor | None,
+        self, position: Tensor, graph: Graph, particle_type: Tensor, bounds: Tensor, context: Tensor | None,
         period: np.ndarray | None = None,
     ) -> Tensor:
         output = self.network(self.features.nodes(position, particle_type, bounds, context), self.features.edges(position, graph, period), graph)
@@ -449,12 +453,8 @@ class GNS(nn.Module):
         graph = radius_graph(position[-1], self.radius, example, self.options.self_edges, period)
         ends = np.cumsum([0, *counts])
         edges = graph.offsets[torch.from_numpy(ends)].diff().tolist()
-        failed = self._clumped(which, edges)
-        if failed:
-            # Without what has clumped: its edges may be too many to go through.
-            others = [number for number in which if number not in failed]
-            found = dict(zip(others, self.advance_many(others), strict=True)) if others else {}
-            return [failed[number] if number in failed else found[number] for number in which]
+        if failed := self._clumped(which, edges):
+            return self._without(failed, which)
         output = self._predict(position, graph, kinds, self._bounds, context, period)
         acceleration = self.features.acceleration(output, position, self._bounds)
         return [self._follow(state, acceleration[first:last]) for state, first, last in zip(states, ends[:-1], ends[1:], strict=True)]
@@ -464,11 +464,17 @@ class GNS(nn.Module):
         failed = {}
         for number, own in zip(which, edges, strict=True):
             state = self._states[number]
-            state.first_edges = state.first_edges or max(own, len(state.kinds))  # without self edges there may be none at first
+            state.measure(own)
             if own > self.options.edge_cap * state.first_edges:
                 cap = f"{self.options.edge_cap:g} x the {state.first_edges} of the start"
                 failed[number] = SimulationError(f"particles clump: {own} edges, {cap} exceeded")
         return failed
+
+    def _without(self, failed: dict[int, SimulationError], which: Sequence[int]) -> list[np.ndarray | SimulationError]:
+        """``advance_many`` without what has clumped: its edges may be too many to go through."""
+        others = [number for number in which if number not in failed]
+        found = dict(zip(others, self.advance_many(others), strict=True)) if others else {}
+        return [failed[number] if number in failed else found[number] for number in which]
 
     def _replayed(self, which: list[int]) -> list[np.ndarray | SimulationError]:
         from learn.replay import RolloutReplay
@@ -478,11 +484,8 @@ class GNS(nn.Module):
                 self._replay.release()
             self._replay = RolloutReplay(self, which, self._states, self._bounds)
         frames, edges = self._replay.compute()
-        failed = self._clumped(which, edges)
-        if failed:
-            others = [number for number in which if number not in failed]
-            found = dict(zip(others, self._replayed(others), strict=True)) if others else {}
-            return [failed[number] if number in failed else found[number] for number in which]
+        if failed := self._clumped(which, edges):
+            return self._without(failed, which)
         self._replay.accept()
         return frames
 

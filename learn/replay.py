@@ -94,7 +94,7 @@ class RolloutReplay:
         first = 0
         for state in self.states:
             if state.first_edges is None:
-                state.first_edges = max(radius_graph(state.position[-1], model.radius, None, model.options.self_edges).edges, len(state.kinds))
+                state.measure(radius_graph(state.position[-1], model.radius, None, model.options.self_edges).edges)
             first += state.first_edges
         self.search = _searching(model, states[0].start.bounds, len(counts), math.ceil(model.options.edge_cap * first) + 1)
         self.shadow = Shadow(model.network)
@@ -141,6 +141,22 @@ class RolloutReplay:
             state.position = self.position[:, a:b].clone()
 
 
+class _Input:
+    """A tensor that stays where it is, and two of the host's that fill it in turn: one is written while the device may still read the other."""
+
+    def __init__(self, device: torch.device, *shape: int, dtype: torch.dtype = torch.float32):
+        self.value = torch.zeros(shape, dtype=dtype, device=device)
+        self._staging = [torch.zeros(shape, dtype=dtype, pin_memory=device.type == "cuda") for _ in range(2)]
+
+    def fill(self, turn: int, given: Tensor) -> None:
+        """With ``given``, and zeros for rows (the second axis, of one the first) that it has not."""
+        staging, axis = self._staging[turn], min(given.ndim - 1, 1)
+        rows = given.shape[axis]
+        staging.narrow(axis, 0, rows).copy_(given)
+        staging.narrow(axis, rows, staging.shape[axis] - rows).zero_()
+        self.value.copy_(staging, non_blocking=True)
+
+
 class TrainingReplay:
     """Training steps on batches of at most ``rows`` particles: loss, gradient, clipping, Adam, the average of the weights.
 
@@ -156,18 +172,13 @@ class TrainingReplay:
         edges = max(graph.edges, particles)  # without self edges there may be none at first
         self.capacity, rows = math.ceil(ROOM * edges * rows / particles), self.rows
 
-        def pair(*shape: int, dtype: torch.dtype = torch.float32) -> tuple[Tensor, tuple[Tensor, Tensor]]:
-            # Written by the host while the device still reads the one before.
-            staging = [torch.zeros(shape, dtype=dtype, pin_memory=self.device.type == "cuda") for _ in range(2)]
-            return torch.zeros(shape, dtype=dtype, device=self.device), tuple(staging)
+        def given(*shape: int, dtype: torch.dtype = torch.float32) -> _Input:
+            return _Input(self.device, *shape, dtype=dtype)
 
-        self.position, self._position = pair(self.frames, rows, dim)
-        self.noise, self._noise = pair(model.velocities + 1, rows, dim)
-        self.kinds, self._kinds = pair(rows, dtype=torch.int64)
-        self.example, self._example = pair(rows, dtype=torch.int64)
-        self.counted, self._counted = pair(rows, dtype=torch.bool)
-        self.context, self._context = pair(*first.context.shape) if first.context is not None else (None, (None, None))
-        self.numbers, self._numbers = pair(3)  # learning rate, decay of the average, 1 where nothing is to change
+        self.position, self.noise = given(self.frames, rows, dim), given(model.velocities + 1, rows, dim)
+        self.kinds, self.example, self.counted = given(rows, dtype=torch.int64), given(rows, dtype=torch.int64), given(rows, dtype=torch.bool)
+        self.context = None if first.context is None else given(*first.context.shape)
+        self.numbers = given(3)  # learning rate, decay of the average, 1 where nothing is to change
         # Losses, gradient norms, steps with a number that is not finite, steps without room; and the edges of the largest graph.
         self.totals = torch.zeros(4, dtype=torch.float64, device=self.device)
         self.most = torch.zeros((), dtype=torch.int64, device=self.device)
@@ -183,7 +194,7 @@ class TrainingReplay:
     def _prepare(self) -> None:
         """Warming up must not train."""
         self._still = not self._still
-        self.numbers[2] = float(self._still)
+        self.numbers.value[2] = float(self._still)
         for parameter in self.parameters:
             parameter.grad = None
         self.totals.zero_()
@@ -194,20 +205,23 @@ class TrainingReplay:
         self.shadow.refresh()
         self.search.most.zero_()  # of this step's graphs alone: the next ones may have room
         with _using(model, self.search, self.shadow):
-            windows = Windows(self.position, self.kinds, self.example, self.context, counted=self.counted)
+            context = None if self.context is None else self.context.value
+            windows = Windows(self.position.value, self.kinds.value, self.example.value, context, counted=self.counted.value)
             for parameter in self.parameters:
                 parameter.grad = None
-            loss = model.loss_under(self.noise, windows)
+            loss = model.loss_under(self.noise.value, windows)
             loss.backward()
         norm = nn.utils.clip_grad_norm_(self.parameters, self.clip)
         room, finite = self.search.most <= self.search.capacity, loss.isfinite() & norm.isfinite()
-        good = room & finite & (self.numbers[2] == 0)
-        self.totals += torch.stack([torch.where(good, loss.detach(), 0), torch.where(good, norm, 0), room & ~finite, ~room])
+        rate, decay, still = self.numbers.value
+        good = room & finite & (still == 0)
+        parts = torch.where(good, loss.detach(), 0), torch.where(good, norm, 0), room & ~finite, ~room
+        self.totals += torch.stack([part.double() for part in parts])
         torch.maximum(self.most, self.search.most, out=self.most)
-        self.optimizer.step(self.numbers[0], found_inf=1 - good.float())
+        self.optimizer.step(rate, found_inf=1 - good.float())
         own = model.state_dict()
         names = [name for name, value in own.items() if value.is_floating_point()]
-        share = torch.where(good, 1 - self.numbers[1], 0.0)
+        share = torch.where(good, 1 - decay, 0.0)
         averages = [self.average[name] for name in names]
         difference = torch._foreach_sub([own[name] for name in names], averages)
         torch._foreach_mul_(difference, share)
@@ -219,19 +233,14 @@ class TrainingReplay:
         self._turn = 1 - turn
         if self._copied:
             self._copied[turn].synchronize()
-        given = {
-            "position": windows.position, "noise": self.model.noise(windows, generator), "kinds": windows.particle_type, "example": windows.example,
-        }
-        for name, value in given.items():
-            staging, axis = getattr(self, f"_{name}")[turn], int(value.ndim == 3)
-            staging.narrow(axis, 0, count).copy_(value)
-            staging.narrow(axis, count, self.rows - count).zero_()
-        self._counted[turn][:count], self._counted[turn][count:] = True, False
+        self.position.fill(turn, windows.position)
+        self.noise.fill(turn, self.model.noise(windows, generator))
+        self.kinds.fill(turn, windows.particle_type)
+        self.example.fill(turn, windows.example)
+        self.counted.fill(turn, torch.ones(count, dtype=torch.bool))
+        self.numbers.fill(turn, torch.tensor([rate, decay, 0.0]))
         if self.context is not None:
-            self._context[turn].copy_(windows.context)
-        self._numbers[turn].copy_(torch.tensor([rate, decay, 0.0]))
-        for name in (*given, "counted", "numbers", *(["context"] if self.context is not None else [])):
-            getattr(self, name).copy_(getattr(self, f"_{name}")[turn], non_blocking=True)
+            self.context.fill(turn, windows.context)
         if self._copied:
             self._copied[turn].record()
         self.replay(self._step, self._prepare)
