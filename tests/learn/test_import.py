@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -102,7 +103,10 @@ def test_an_interrupted_import_leaves_nothing(tmp_path, number, code):
     )
     arguments = ["import", str(tmp_path / "in"), *IMPORT[2:], str(tmp_path / "out")]
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    with subprocess.Popen([sys.executable, "-c", program, *arguments], env=environment, stdout=subprocess.PIPE, text=True) as process:
+    command = [sys.executable, "-c", program, *arguments]
+    # A shell ignores SIGINT in what it runs in the background, and children inherit that.
+    heard = partial(signal.signal, signal.SIGINT, signal.default_int_handler)
+    with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True, preexec_fn=heard) as process:
         assert process.stdout.readline() == "half\n"
         assert any(path.name.startswith(".out") for path in tmp_path.iterdir())
         process.send_signal(number)
