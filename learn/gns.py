@@ -27,6 +27,7 @@ from pydantic import BaseModel, ConfigDict, Field, PositiveInt, model_validator
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from learn import tiles
 from learn.features import Features, InputScaling, NoiseScheme, velocity_noise
 from learn.graph import Graph, radius_graph
 from learn.model import check_start
@@ -108,8 +109,20 @@ class MLP(nn.Module):
         """Weight, bias of every layer but the first, then LayerNorm's weight and bias."""
         return [p for linear in self.linears[1:] for p in (linear.weight, linear.bias)] + [self.norm.weight, self.norm.bias]
 
+    def tiled(self, dtype: torch.dtype) -> bool:
+        """Whether ``tiles.mlp`` can take this: for rollouts, which need no gradient."""
+        latent = self.linears[-1].out_features
+        return self.norm is not None and not torch.is_grad_enabled() and tiles.supports(latent, len(self.linears) - 1, dtype, self.linears[0].weight)
+
+    def tiles(self, inputs: list[Tensor], dtype: torch.dtype, out: Tensor, residual: bool = False) -> Tensor:
+        """``tiles.mlp`` of this."""
+        norm = (self.norm.weight, self.norm.bias, NORM_EPSILON)
+        return tiles.mlp(inputs, [(linear.weight, linear.bias) for linear in self.linears], norm, dtype, out, residual)
+
     def forward(self, x: Tensor, dtype: torch.dtype) -> Tensor:
         """[rows, inputs] -> [rows, outputs], products in ``dtype``, the result in the parameters' type."""
+        if self.tiled(dtype):
+            return self.tiles([x], dtype, x.new_empty(len(x), self.linears[-1].out_features))
         return self.finish(_linear(x, self.linears[0].weight, self.linears[0].bias, dtype), dtype)
 
     def finish(self, x: Tensor, dtype: torch.dtype) -> Tensor:
@@ -138,6 +151,8 @@ def _edge_pass(graph: Graph, dtype: torch.dtype, table: Tensor, edges: Tensor, f
     (parameters' type), e + m (in ``dtype``), and what backward needs: the hidden layers, the last linear output, its mean and 1 / std.
     Without ``keep`` e is updated in place and one run's buffers serve all.
     """
+    if tiles.supports(table.shape[2], len(rest) // 2 - 1, dtype, first):
+        return tiles.edge_pass(graph, table, edges, first, rest, NORM_EPSILON, update, keep)
     *layers, gamma, beta = rest
     weights, biases = [w.to(dtype).t() for w in layers[::2]], [b.to(dtype) for b in layers[1::2]]
     first, rows = first.to(dtype).t(), table.flatten(0, 1)
@@ -183,6 +198,12 @@ class _EdgeUpdate(torch.autograd.Function):
     def backward(ctx, grad_sums: Tensor, grad_updated: Tensor | None):
         graph, dtype, n = ctx.graph, ctx.dtype, ctx.layers
         edges, first, *saved = ctx.saved_tensors
+        if tiles.supports(edges.shape[1], n, dtype, first):
+            rest, kept = saved[: 2 * n + 2], saved[2 * n + 2 :]
+            grad_edges = torch.zeros_like(edges) if grad_updated is None else grad_updated.contiguous()
+            grad_table, grad_input, grad_first, rest = tiles.edge_gradient(graph, edges, first, rest, kept, grad_sums, grad_edges)
+            grad_table[:, 1] = _bag_sum(grad_input, graph.reverse, graph.offsets)
+            return None, None, None, grad_table, grad_edges, grad_first, *rest
         weights, (gamma, beta), (*hidden, z, mean, rstd) = saved[: 2 * n : 2], saved[2 * n : 2 * n + 2], saved[2 * n + 2 :]
         grad_first, grad_weights = torch.zeros_like(first), [torch.zeros_like(w) for w in weights]
         grad_biases = [torch.zeros_like(gamma) for _ in weights]
@@ -232,6 +253,8 @@ class Interaction(nn.Module):
         table = _linear(nodes, weight, F.pad(edge.bias, (0, d)), dtype).view(-1, 2, d)
         step = _EdgeUpdate.apply if torch.is_grad_enabled() else _edge_pass_in_place
         sums, updated = step(graph, dtype, self.edge_update, table, edges, edge.weight[:, :d], *self.edge.rest())
+        if self.node.tiled(dtype):
+            return self.node.tiles([sums, nodes], dtype, nodes, residual=True), edges if updated is None else updated
         own = _linear(nodes, node.weight[:, d:], node.bias, dtype)
         update = self.node.finish(own + _linear(sums, node.weight[:, :d], None, dtype), dtype)
         return nodes + update, edges if updated is None else updated
@@ -262,6 +285,8 @@ class Network(nn.Module):
         nodes = self.encode_node(nodes, dtype)
         if isinstance(self.encode_edge, nn.Parameter):
             edges = self.encode_edge.to(dtype).repeat(graph.edges, 1)
+        elif self.encode_edge.tiled(dtype):
+            edges = self.encode_edge.tiles([edges], dtype, nodes.new_empty(graph.edges, nodes.shape[1], dtype=dtype))
         else:
             edges = torch.cat([self.encode_edge(edges[run.edges], dtype).to(dtype) for run in graph.runs])
         for _ in range(self.repeats):

@@ -1,4 +1,4 @@
-"""What a result depends on in the code: the modules a program imports, directly or not, hashed without comments and docstrings.
+"""What a result depends on in the code: the modules a program imports, directly or not, hashed without comments and docstrings, and C++ beside them.
 
 Rules carry the hash among their parameters, so that an edit of the solver makes its data again, an edit of a figure does not, and an
 edit of a comment nothing at all. Imports are read from the source: nothing is imported for it.
@@ -23,7 +23,8 @@ def _file(module: str) -> Path | None:
 @cache
 def _parsed(module: str) -> tuple[str, frozenset[str]]:
     """(hash of the module's code, names it imports that may be modules of ours)."""
-    tree = ast.parse(_file(module).read_text())
+    file = _file(module)
+    tree, foreign = ast.parse(file.read_text()), file.with_suffix(".cpp")
     names: set[str] = set()
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
@@ -36,7 +37,8 @@ def _parsed(module: str) -> tuple[str, frozenset[str]]:
         documented = isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and body and isinstance(body[0], ast.Expr)
         if documented and isinstance(body[0].value, ast.Constant):
             node.body = body[1:]
-    return hashlib.sha256(ast.dump(tree).encode()).hexdigest(), frozenset(names)
+    code = ast.dump(tree).encode() + (foreign.read_bytes() if foreign.is_file() else b"")
+    return hashlib.sha256(code).hexdigest(), frozenset(names)
 
 
 def closure(*modules: str) -> list[str]:

@@ -11,6 +11,7 @@ from textbook_gns import TextbookNetwork
 from torch import nn
 
 from learn import graph as graph_module
+from learn import tiles
 from learn.dataset import DataSpec, Windows
 from learn.features import random_walk_noise
 from learn.gns import GNS
@@ -69,8 +70,9 @@ def test_initialisation_is_truncated_normal():
 
 
 def textbook_case(dtype: torch.dtype, **settings):
+    """Of a seed where no sum before a ReLU is so near zero that float32 may see it on the other side: one does change a gradient by 1e-3."""
     model = small(latent=32, message_passing=3, **settings).to(dtype)
-    w = windows(6, particles=100)
+    w = windows(6, particles=100, seed=1)
     position = w.position.to(dtype)
     graph = radius_graph(position[-1], model.radius, w.example)
     nodes, edges = model.features.nodes(position, w.particle_type, model.features.bounds), model.features.edges(position, graph)
@@ -97,10 +99,14 @@ def test_equals_the_textbook_form(settings, run, monkeypatch):
         assert relative(network(nodes, edges, graph), wanted) < 1e-12
 
     single = copy.deepcopy(network).float()
-    found = single(nodes.float(), edges.float(), graph)
-    assert relative(found, wanted) < 1e-5
-    gradients = torch.autograd.grad(found.square().sum(), list(single.parameters()))
-    assert max(relative(a, b) for a, b in zip(gradients, wanted_gradients, strict=True)) < 1e-4
+    for _ in ("by tiles, where there is a compiler", "by plain operations"):
+        found = single(nodes.float(), edges.float(), graph)
+        assert relative(found, wanted) < 1e-5
+        gradients = torch.autograd.grad(found.square().sum(), list(single.parameters()))
+        assert max(relative(a, b) for a, b in zip(gradients, wanted_gradients, strict=True)) < 1e-5
+        with torch.inference_mode():
+            assert relative(single(nodes.float(), edges.float(), graph), wanted) < 1e-5
+        monkeypatch.setattr(tiles, "build", lambda: None)
 
 
 def test_gradient_reaches_the_features():
