@@ -416,20 +416,27 @@ void backward(const Backward& b) {
     for (int c = 0; c < latent; c += LANES) store((T*)b.grad_table + 2 * present * latent + c, load(sum.at + c));
 }
 
+// Every call's rows on a thread of its own.
+template <class Call>
+void each(const Call* calls, int64_t count, void (*work)(const Call&)) {
+#pragma omp parallel for num_threads(count) schedule(static, 1)
+  for (int64_t call = 0; call < count; ++call) work(calls[call]);
+}
+
 }  // namespace
 
 extern "C" {
 
-void forward_f32(const Forward* f) { forward<float>(*f); }
-void backward_f32(const Backward* b) { backward<float>(*b); }
+void forward_f32(const Forward* calls, int64_t count) { each(calls, count, forward<float>); }
+void backward_f32(const Backward* calls, int64_t count) { each(calls, count, backward<float>); }
 int64_t width() { return WIDE; }
 #if defined(__AVX512BF16__)
 int64_t multiplies_bf16() { return 1; }
-void forward_bf16(const Forward* f) { forward<bf16>(*f); }
-void backward_bf16(const Backward* b) { backward<bf16>(*b); }
+void forward_bf16(const Forward* calls, int64_t count) { each(calls, count, forward<bf16>); }
+void backward_bf16(const Backward* calls, int64_t count) { each(calls, count, backward<bf16>); }
 #else
 int64_t multiplies_bf16() { return 0; }
-void forward_bf16(const Forward*) { abort(); }
-void backward_bf16(const Backward*) { abort(); }
+void forward_bf16(const Forward*, int64_t) { abort(); }
+void backward_bf16(const Backward*, int64_t) { abort(); }
 #endif
 }

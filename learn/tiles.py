@@ -7,8 +7,9 @@ units can do (``benchmarks/gns.py``).
 Decisions: plain C++ behind a C interface, built by the compiler that is there in a few seconds and kept in ``.kernel_cache`` by its source,
 compiler and processor (PyTorch's own headers would take half a minute); without a compiler, or where it fails, ``build`` says so once and the
 GNS goes the plain way. Vectors are the compiler's, so that the float32 kernels serve any processor; bfloat16 needs AVX-512 BF16. Threads are
-Python's, which a foreign call leaves free, each with its own receivers, so that sums have one order whatever the number of threads; gradients of
-weights are summed by thread, and differ in their last digits between numbers of threads.
+those of the OpenMP that PyTorch has loaded (others would fight its own for the cores, which wait by spinning), each with its own receivers, so
+that sums have one order whatever the number of threads; gradients of weights are summed by thread, and differ in their last digits between
+numbers of threads.
 """
 
 from __future__ import annotations
@@ -21,7 +22,6 @@ import shutil
 import subprocess
 import tempfile
 import warnings
-from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from pathlib import Path
 
@@ -31,13 +31,13 @@ from torch import Tensor
 from learn.graph import Graph
 
 SOURCE = Path(__file__).with_name("tiles.cpp")
-FLAGS = ("-O3", "-march=native", "-std=gnu++17", "-shared", "-fPIC")
+FLAGS = ("-O3", "-march=native", "-std=gnu++17", "-fopenmp", "-shared", "-fPIC")
 #: Layers after the first that a kernel has room for (``MOST`` in the source).
 MOST = 8
 #: Widest latent: beyond, a tile does not fit in the caches it was made for.
 WIDEST = 512
 #: Rows below which a second thread costs more than it does.
-SHARE = 1024
+SHARE = 256
 
 _Pointers = ctypes.c_void_p * MOST
 
@@ -107,7 +107,7 @@ def _declared(library: ctypes.CDLL) -> ctypes.CDLL:
     for name, structure in (("forward", _Forward), ("backward", _Backward)):
         for dtype in ("f32", "bf16"):
             function = getattr(library, f"{name}_{dtype}")
-            function.argtypes, function.restype = [ctypes.POINTER(structure)], None
+            function.argtypes, function.restype = [ctypes.POINTER(structure), ctypes.c_int64], None
     for name in ("width", "multiplies_bf16"):
         getattr(library, name).restype = ctypes.c_int64
     return library
@@ -122,18 +122,10 @@ def supports(latent: int, layers: int, dtype: torch.dtype, weight: Tensor) -> bo
     return latent % library.width() == 0 and (dtype == torch.float32 or bool(library.multiplies_bf16()))
 
 
-@cache
-def _pool(threads: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(threads, thread_name_prefix="tiles")
-
-
 def _run(name: str, dtype: torch.dtype, calls: list[ctypes.Structure]) -> None:
     """One kernel with every call's arguments, each on its own thread."""
     function = getattr(build(), f"{name}_{'f32' if dtype == torch.float32 else 'bf16'}")
-    others = [_pool(len(calls) - 1).submit(function, call) for call in calls[1:]]
-    function(calls[0])
-    for other in others:
-        other.result()
+    function((type(calls[0]) * len(calls))(*calls), len(calls))
 
 
 def _pointer(tensor: Tensor | None) -> int | None:
