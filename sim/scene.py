@@ -8,6 +8,7 @@ wall always lies on a grid node and mass is exact; lengths that would have to ag
 from __future__ import annotations
 
 import copy
+import dataclasses
 import json
 from dataclasses import dataclass
 from functools import cached_property
@@ -494,8 +495,11 @@ class Scene(_Physics):
         Packing: one recorded particle per cube of edge ``spacing``, mass density * spacing^dim. A body is the union of the
         lattice cubes whose centres lie in it, so its mass is the same at every refinement. The recorded particle of a cube
         is the central one of its refine^dim particles, or one of the 2^dim central ones drawn at random (unbiased) when
-        ``refine`` is even. ``refine=1`` gives the recorded particles of the *same* layout: the same set in every rung.
+        ``refine`` is even. ``refine=1`` gives the recorded particles of the *same* layout: the same set in every rung. So does anything
+        between 1 and the teacher's: a coarser lattice in the same cubes, where one of each cube's central particles is put where the teacher's is.
         """
+        if refine not in (None, 1, self.refine):
+            return self._between(refine)
         coarse = refine == 1
         k, dim, spacing = self.refine, self.dim, self.spacing
         rng = np.random.default_rng(np.random.SeedSequence([self.seed, 1]))
@@ -529,6 +533,20 @@ class Scene(_Physics):
             position, velocity, material, bodies = position[tracked], velocity[tracked], material[tracked], bodies[tracked]
             tracked = np.ones(len(position), bool)
         return Particles(position, velocity, material, bodies, np.flatnonzero(tracked), spacing if coarse else spacing / k)
+
+    def _between(self, refine: int) -> Particles:
+        recorded, own = self.particles(refine=1), self.model_copy(update={"refine": refine}).particles()
+        position = own.position.copy()
+        position[own.tracked] = recorded.position
+        return dataclasses.replace(own, position=position)
+
+    def refinement(self, particles: Literal["teacher", "recorded"] | int) -> int:
+        """How much finer than the recorded ones a solver's particles are, by its setting ``particles``. Raises ``InputError``."""
+        if particles in ("teacher", "recorded"):
+            return self.refine if particles == "teacher" else 1
+        if particles > self.refine:
+            raise InputError(self.name, "particles", particles, f"finer than the teacher's, which are refined {self.refine} times; use teacher")
+        return particles
 
     @cached_property
     def surfaces(self) -> list:

@@ -803,7 +803,8 @@ class MPMSimulator:
 
     Overrides make the rungs of a solver ladder: ``cfl`` (Courant number; default the scene's), ``stiffness`` (factor on the
     elastic moduli), ``coarsen`` (factor on the grid spacing of the recorded resolution; implies the recorded particles),
-    ``particles`` ("teacher": refined as the scene says; "recorded": the tracked set alone, on the recorded grid),
+    ``particles`` ("teacher": refined as the scene says; "recorded": the tracked set alone, on the recorded grid; a number: so many times finer,
+    grid and particles),
     ``perturbation`` (length: random displacement of the start, for the chaos floor), ``frames`` (that ``advance`` hands out at once, as a
     model that predicts so many does: one launch, and one plan of the time step, for all).
 
@@ -812,13 +813,13 @@ class MPMSimulator:
     """
 
     def __init__(self, *, name: str = "mpm", kind: Kind = "reference", cfl: float | None = None, stiffness: float = 1.0, coarsen: float = 1.0,
-                 particles: str = "teacher", perturbation: float = 0.0, frames: int = 1, serial: bool | None = None,
+                 particles: str | int = "teacher", perturbation: float = 0.0, frames: int = 1, serial: bool | None = None,
                  unguarded_step: float | None = None):
-        if particles not in ("teacher", "recorded"):
-            raise InputError(name, "particles", particles, "must be teacher or recorded")
+        if particles not in ("teacher", "recorded") and not (isinstance(particles, int) and particles > 0):
+            raise InputError(name, "particles", particles, "must be teacher, recorded or how many times finer than those")
         if frames < 1:
             raise InputError(name, "frames", frames, "must be at least 1")
-        if particles == "teacher" and coarsen != 1.0:
+        if particles != "recorded" and coarsen != 1.0:
             raise InputError(name, "coarsen", coarsen, "a coarser grid needs particles: recorded")
         self.name, self.kind = name, kind
         self.settings = {"cfl": cfl, "stiffness": stiffness, "coarsen": coarsen, "particles": particles, "perturbation": perturbation,
@@ -909,7 +910,7 @@ class MPMSimulator:
         return column_table(scene.surfaces, _frictions(scene), np.array(scene.bounds)[:, 0], self._spacing(scene), nodes)
 
     def _refine(self, scene: Scene) -> int:
-        return scene.refine if self.settings["particles"] == "teacher" else 1
+        return scene.refinement(self.settings["particles"])
 
     def _cells(self, scene: Scene) -> np.ndarray:
         """[dim] grid cells along the box. A coarser grid whose cells would not be square is refused rather than stretched."""

@@ -485,14 +485,14 @@ class PBDSimulator:
     """The solver under the ``Simulator`` contract; also driven directly by ``load`` and ``frame``.
 
     Overrides make the rungs of a solver ladder: ``cfl`` (Courant number; default the scene's), ``particles`` ("teacher": refined as the scene
-    says; "recorded": the tracked set alone), ``tolerance`` (factor on the error at which a solve ends), ``perturbation`` (length: random displacement
-    of the start, for the chaos floor).
+    says; "recorded": the tracked set alone; a number: so many times finer), ``tolerance`` (factor on the error at which a solve ends),
+    ``perturbation`` (length: random displacement of the start, for the chaos floor).
     """
 
-    def __init__(self, *, name: str = "pbd", kind: Kind = "reference", cfl: float | None = None, particles: str = "teacher", tolerance: float = 1.0,
-                 perturbation: float = 0.0):
-        if particles not in ("teacher", "recorded"):
-            raise InputError(name, "particles", particles, "must be teacher or recorded")
+    def __init__(self, *, name: str = "pbd", kind: Kind = "reference", cfl: float | None = None, particles: str | int = "teacher",
+                 tolerance: float = 1.0, perturbation: float = 0.0):
+        if particles not in ("teacher", "recorded") and not (isinstance(particles, int) and particles > 0):
+            raise InputError(name, "particles", particles, "must be teacher, recorded or how many times finer than those")
         self.name, self.kind = name, kind
         self.settings = {"cfl": cfl, "particles": particles, "tolerance": tolerance, "perturbation": perturbation}
         self.compile_seconds = 0.0
@@ -505,7 +505,7 @@ class PBDSimulator:
         return Structure(scene.dim, 1 << (rigid - 1).bit_length() if rigid else 0, scene.solver.xsph > 0, scene.solver.tensile > 0)
 
     def _refine(self, scene: Scene) -> int:
-        return scene.refine if self.settings["particles"] == "teacher" else 1
+        return scene.refinement(self.settings["particles"])
 
     def _layout(self, scene: Scene) -> tuple[float, float, np.ndarray]:
         """Spacing and support radius [length], cells along each axis."""

@@ -376,17 +376,17 @@ class SPHSimulator:
     """The solver under the ``Simulator`` contract; also driven directly by ``load`` and ``frame``.
 
     Overrides make the rungs of a solver ladder: ``cfl`` (Courant number; default the scene's), ``particles`` ("teacher": refined as the scene
-    says; "recorded": the tracked set alone), ``tolerance`` (factor on the errors at which DFSPH's solves end), ``stiffness`` (factor on the
-    square of WCSPH's speed of sound), ``perturbation`` (length: random displacement of the start, for the chaos floor).
+    says; "recorded": the tracked set alone; a number: so many times finer), ``tolerance`` (factor on the errors at which DFSPH's solves end),
+    ``stiffness`` (factor on the square of WCSPH's speed of sound), ``perturbation`` (length: random displacement of the start, for the chaos floor).
 
     A scene's ``time_step`` holds unless ``cfl`` is given. ``unguarded_step`` [s] is for ``sim.stability`` alone: a fixed step that nothing
     refuses or shortens, pressures that did not converge included, to see where the solver really becomes unstable.
     """
 
-    def __init__(self, *, name: str = "sph", kind: Kind = "reference", cfl: float | None = None, particles: str = "teacher", tolerance: float = 1.0,
-                 stiffness: float = 1.0, perturbation: float = 0.0, unguarded_step: float | None = None):
-        if particles not in ("teacher", "recorded"):
-            raise InputError(name, "particles", particles, "must be teacher or recorded")
+    def __init__(self, *, name: str = "sph", kind: Kind = "reference", cfl: float | None = None, particles: str | int = "teacher",
+                 tolerance: float = 1.0, stiffness: float = 1.0, perturbation: float = 0.0, unguarded_step: float | None = None):
+        if particles not in ("teacher", "recorded") and not (isinstance(particles, int) and particles > 0):
+            raise InputError(name, "particles", particles, "must be teacher, recorded or how many times finer than those")
         self.name, self.kind = name, kind
         self.settings = {"cfl": cfl, "particles": particles, "tolerance": tolerance, "stiffness": stiffness, "perturbation": perturbation}
         self.unguarded_step = unguarded_step
@@ -412,7 +412,7 @@ class SPHSimulator:
         return Structure(scene.dim, solver.method, periodic, no_slip, viscous, shifting, xsph, full, bool(scene.obstacles), rigid)
 
     def _refine(self, scene: Scene) -> int:
-        return scene.refine if self.settings["particles"] == "teacher" else 1
+        return scene.refinement(self.settings["particles"])
 
     def _layout(self, scene: Scene) -> tuple[float, float, np.ndarray]:
         """Spacing and support radius [length], cells along each axis."""

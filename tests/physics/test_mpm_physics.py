@@ -6,8 +6,8 @@ Scenes of water share one solver and scenes of sand another, so that each struct
 import numpy as np
 import pytest
 
-from sim.mpm.solver import WALL
-from sim.scene import Scene
+from sim.mpm.solver import WALL, MPMSimulator
+from sim.scene import Scene, SceneFamily
 
 pytestmark = pytest.mark.physics
 G = 9.8
@@ -266,3 +266,16 @@ def test_sand_slides_with_coulomb_friction(sand, mu):
     t = 0.005 * np.arange(1, 65)
     deceleration = -np.polyfit(t[10:], speeds[10:], 1)[0]
     assert deceleration == pytest.approx(mu * G, rel=0.05), deceleration / (mu * G)
+
+
+@pytest.mark.physics
+def test_a_rung_between_is_nearer_to_the_teacher_than_the_recorded_resolution():
+    """Sand that falls and slumps, which is not chaotic: half as fine as the teacher, the recorded particles end nearer to its own."""
+    scene = SceneFamily.load("configs/scenes/sand_demo.yaml").sample(seed=3)
+    teacher, between, recorded = (MPMSimulator(particles=particles) for particles in ("teacher", 2, "recorded"))
+    ends = []
+    for solver in (teacher, between, recorded):
+        solver.load(scene)
+        ends.append([solver.frame() for _ in range(120)][-1])
+    near, far = (np.square(end - ends[0]).sum(1).mean() for end in ends[1:])
+    assert near < 0.5 * far < 0.1 * np.square(ends[0] - scene.start()).sum(1).mean()

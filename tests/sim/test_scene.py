@@ -105,6 +105,25 @@ def test_the_recorded_set_is_the_same_in_every_rung(make, refine):
 
 
 @pytest.mark.parametrize("make", [family, cube])
+@pytest.mark.parametrize("refine", [2, 3])
+def test_a_rung_between_starts_its_recorded_particles_where_the_teacher_does(make, refine):
+    scene = Scene.from_dict(make().sample(2).to_dict() | {"refine": 4})
+    between, coarse = scene.particles(refine), scene.particles(refine=1)
+    assert len(between.position) == refine**scene.dim * len(coarse.position) and between.spacing == scene.spacing / refine
+    np.testing.assert_array_equal(between.position[between.tracked], coarse.position)
+    np.testing.assert_array_equal(between.velocity[between.tracked], coarse.velocity)
+    np.testing.assert_array_equal(between.material[between.tracked], coarse.material)
+    np.testing.assert_array_equal(between.body[between.tracked], coarse.body)
+    # The one that was put elsewhere was one of its cube's central particles.
+    own = Scene.from_dict(scene.to_dict() | {"refine": refine}).particles()
+    moved = np.abs(between.position - own.position).max(1)
+    assert (np.delete(moved, between.tracked) == 0).all() and 0 < moved.max() < 0.75 * scene.spacing
+    assert scene.refinement(refine) == refine and scene.refinement("teacher") == 4 and scene.refinement("recorded") == 1
+    with pytest.raises(InputError, match="particles = 5: finer than the teacher's, which are refined 4 times; use teacher"):
+        scene.refinement(5)
+
+
+@pytest.mark.parametrize("make", [family, cube])
 def test_mass_is_the_same_at_every_refinement(make):
     scene = make().sample(5)
     names = list(scene.materials)
