@@ -21,9 +21,7 @@ study: setup ## any study: make study STUDY=paper
 	@$(SNAKEMAKE)
 	@echo "Done: results/$(STUDY)/report.html"
 
-resume: setup ## after a kill or a power cut: make resume STUDY=demo continues where it stopped
-	@$(SNAKEMAKE) --unlock
-	@$(MAKE) --no-print-directory study STUDY=$(STUDY)
+resume: study ## after a kill or a power cut: make resume STUDY=demo continues where it stopped, as make study does
 
 test: setup
 	@$(PY) -m ruff check .

@@ -6,11 +6,14 @@ import sys
 sys.path.insert(0, workflow.basedir)
 
 from sim.errors import InputError
+from workflow.alone import hold
 from workflow.sources import code_hash
 from workflow.study import PARTS, load_study
 
 try:
     STUDY = load_study(config.get("study", "configs/studies/smoke.yaml"))
+    if workflow.is_main_process and not {"-n", "--dry-run", "--dryrun"} & set(sys.argv):
+        hold(STUDY.folder)
 except InputError as error:
     # Snakemake turns every exception into a traceback of its own; a mistake in a study is one line and exit code 2.
     print(f"sluice: {error}", file=sys.stderr, flush=True)

@@ -1,0 +1,27 @@
+"""One run a study at a time. Studies have folders of their own, so different ones may run side by side.
+
+Snakemake's own lock (off, see ``profiles/default``) outlives a killed run, and ``--unlock`` takes it from every study of the checkout, also from
+one that is at work; this one is dropped by the kernel with the process that holds it, however that dies.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+from pathlib import Path
+
+from sim.errors import InputError
+
+
+def hold(folder: Path) -> None:
+    """Hold the results of a study until this process ends; ``InputError`` while another run holds them."""
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    lock = os.open(folder.parent / f".{folder.name}.lock", os.O_CREAT | os.O_RDWR)
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        process = os.read(lock, 20).decode()
+        remedy = f"another run is at work on it (process {process}); wait for its end, or stop it: kill -INT {process}"
+        raise InputError(folder, "study", folder.name, remedy) from None
+    os.ftruncate(lock, 0)
+    os.write(lock, str(os.getpid()).encode())
