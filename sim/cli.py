@@ -143,7 +143,9 @@ def _render(options: argparse.Namespace) -> int:
     from sim.trajectory import ShardReader
 
     with ShardReader(options.shard) as reader:
-        trajectory = reader.read(options.index if options.index is not None else reader.indices()[0])
+        if not (indices := reader.indices()):
+            raise InputError(options.shard, "groups", [], "holds no trajectory; give another shard")
+        trajectory = reader.read(options.index if options.index is not None else indices[0])
     from sim.render import render_trajectory
 
     render_trajectory(options.out, trajectory)

@@ -143,14 +143,7 @@ def _source(path: Path, split: str | None) -> _Source:
     if not finished or split not in (None, *finished):
         remedy = f"the data set holds {', '.join(finished) or 'no finished split'}; generate what is missing"
         raise InputError(path / "dataset.json", "split", split, remedy)
-    shards = {}
-    for name in [split] if split else finished:
-        try:
-            shards[name] = [path / shard for shard in splits[name]["shards"]]
-            int(splits[name]["ok"]), [(int(failure["index"]), str(failure["status"])) for failure in splits[name]["failed"]]
-        except (KeyError, TypeError, ValueError):
-            raise InputError(path / "dataset.json", f"splits.{name}", splits[name], "incomplete; generate the data set again") from None
-    return _Source(path, content, shards)
+    return _Source(path, content, {name: [path / shard for shard in splits[name]["shards"]] for name in ([split] if split else finished)})
 
 
 def _trajectories(source: _Source, index: int | None = None, split: str | None = None) -> Iterator[tuple[str, ShardReader, int]]:
@@ -208,10 +201,7 @@ def _context(reader: ShardReader, number: int) -> dict[str, np.ndarray]:
     context = reader.context(number)
     if context is None:
         return {}
-    (frames, _, dim), scene = reader.shape(number), reader.meta(number)["scene"]
-    if context.ndim != 2 or len(context) != frames:
-        raise InputError(reader.path, f"{number:06d}/context", context.shape, "must be [frames, c]; generate the shard again")
-    scene = scene if isinstance(scene, dict) else {}
+    dim, scene = reader.shape(number)[2], reader.meta(number)["scene"]
     columns = {_ACCELERATION: dim} if scene.get("container") else {}
     columns |= dict.fromkeys(scene.get("context") or [], 1)
     if sum(columns.values()) != context.shape[1]:

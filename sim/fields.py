@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import json
+import math
 from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
+from sim.trajectory import LARGEST
+
+Positive = Annotated[float, Field(gt=0, le=LARGEST, allow_inf_nan=False)]
+Finite = Annotated[float, Field(ge=-LARGEST, le=LARGEST, allow_inf_nan=False)]
 #: A fixed number or a [low, high] range that is sampled uniformly.
 Range = Finite | tuple[Finite, Finite]
 #: Coulomb's coefficient of a wall or an obstacle; ``sticky`` holds everything that touches.
@@ -45,3 +48,15 @@ def check_range(key: str, value: Range, least: float | None = None, remedy: str 
         raise mistake(key, value, "low must not exceed high")
     if least is not None and low < least:
         raise mistake(key, value, remedy)
+
+
+def entries(content: object, known: dict[int, float] | None = None) -> float:
+    """How many entries nested dicts, lists and tuples have once every reference is followed: more than memory holds in some lines that refer
+    to each other, infinitely many in what holds itself."""
+    if not isinstance(content, (dict, list, tuple)):
+        return 1
+    known = {} if known is None else known
+    if id(content) not in known:
+        known[id(content)] = math.inf  # until it is known: who meets it before is inside it
+        known[id(content)] = 1 + sum(entries(value, known) for value in (content.values() if isinstance(content, dict) else content))
+    return known[id(content)]

@@ -195,7 +195,28 @@ def read_content(out: str | Path) -> dict:
     for key, kind in outline.items():
         if key not in content or not isinstance(content[key], kind):
             raise InputError(path, key, content.get(key), "missing or of the wrong kind; generate the data set again")
+    for split, entry in content["splits"].items():
+        if fault := _split_fault(entry):
+            key, value = fault
+            raise InputError(path, f"splits.{split}{key}", value, "missing or of the wrong kind; generate the data set again")
+    if not isinstance(content.get("statistics"), dict | None):
+        raise InputError(path, "statistics", content["statistics"], "must be a mapping or null; generate the data set again")
     return content
+
+
+def _split_fault(entry: object) -> tuple[str, object] | None:
+    """Key and value of the first fault in the outline of a split's entry in ``dataset.json``."""
+    if not isinstance(entry, dict):
+        return "", entry
+    cost = entry.get("cost") or {}
+    sound = {
+        "trajectories": type(entry.get("trajectories")) is int, "ok": type(entry.get("ok")) is int,
+        "shards": isinstance(entry.get("shards"), list) and all(isinstance(shard, str) and "\0" not in shard for shard in entry["shards"]),
+        "failed": isinstance(entry.get("failed"), list)
+        and all(isinstance(one, dict) and {"index", "seed", "status"} <= one.keys() and type(one["index"]) is int for one in entry["failed"]),
+        "cost": cost == {} or isinstance(cost, dict) and all(isinstance(cost.get(key), int | float) for key in ("wall_seconds", "compile_seconds")),
+    }
+    return next(((f".{key}", entry.get(key)) for key, good in sound.items() if not good), None)
 
 
 def _existing(out: Path, settings: dict) -> dict | None:

@@ -49,7 +49,18 @@ from sim.export import LEARNER_FORMATS, crc32c, masked
 from sim.fields import Finite, Positive
 from sim.generate import DEFAULT_SHARD_SIZE, SPLITS, training_statistics
 from sim.scene import explain_validation
-from sim.trajectory import FORMAT_VERSION, KINEMATIC_TYPE, PARTICLE_TYPES, Trajectory, atomic_folder, vacant, write_json, write_shard
+from sim.trajectory import (
+    FORMAT_VERSION,
+    KINEMATIC_TYPE,
+    MOST_PACKED,
+    PARTICLE_TYPES,
+    Trajectory,
+    atomic_folder,
+    stored,
+    vacant,
+    write_json,
+    write_shard,
+)  # fmt: skip
 
 #: A statistic of the source that is farther than this from ours, as a share of our standard deviation, is told to the user.
 TOLERANCE = 0.01
@@ -58,9 +69,6 @@ TOLERANCE = 0.01
 _LAGRANGEBENCH_TYPES = {0: PARTICLE_TYPES["water"], 1: KINEMATIC_TYPE, 2: KINEMATIC_TYPE, 3: PARTICLE_TYPES["rigid"]}
 #: Particle types that a learner embeds.
 _TYPE_SLOTS = 9
-#: Deflate packs at most 1032 to 1; a file that promises more would fill the memory before it turned out to be damaged.
-_MOST_PACKED = 1100
-
 
 @dataclass(frozen=True)
 class Comparison:
@@ -468,7 +476,7 @@ def _read_npz(path: Path, source: _Source) -> Iterator[_Raw]:
 
 def _read_objects(path: Path, archive: zipfile.ZipFile, entry: zipfile.ZipInfo, trusted: bool) -> list:
     """The items of an object array."""
-    if entry.file_size > _MOST_PACKED * max(entry.compress_size, 1):
+    if entry.file_size > MOST_PACKED * max(entry.compress_size, 1):
         raise InputError(path, entry.filename, entry.file_size, "promises more than it can hold; copy the file again")
     with archive.open(entry) as file:
         version = np.lib.format.read_magic(file)
@@ -570,20 +578,8 @@ def _read_lagrangebench(path: Path, source: _Source) -> Iterator[_Raw]:
             names = sorted(file)
         for name in names:
             with _reading(path, name):
-                position, kinds = (_dataset(path, file, f"{name}/{key}")[()] for key in ("position", "particle_type"))
+                position, kinds = (stored(path, file, f"{name}/{key}")[()] for key in ("position", "particle_type"))
             yield position, kinds, None
-
-
-def _dataset(path: Path, file: h5py.File, name: str) -> h5py.Dataset:
-    """A data set that lies in this file, and can hold what it promises. HDF5 could as well point to any other file of the machine."""
-    group = name.split("/")[0]
-    links = [file.get(part, getlink=True) for part in (group, name)]
-    dataset = file[name] if all(isinstance(link, h5py.HardLink) for link in links) else None
-    if not isinstance(dataset, h5py.Dataset) or dataset.external or dataset.is_virtual:
-        raise InputError(path, name, str(dataset), "must be a data set within the file")
-    if dataset.nbytes > _MOST_PACKED * dataset.id.get_storage_size():
-        raise InputError(path, name, f"{dataset.dtype} {list(dataset.shape)}", "promises more than it holds; copy the file again")
-    return dataset
 
 
 _READERS = {"deepmind": (".tfrecord", _read_tfrecord), "geoelements": (".npz", _read_npz), "lagrangebench": (".h5", _read_lagrangebench)}

@@ -49,7 +49,7 @@ def _dataset_text(path: Path) -> str:
     lines = [f"data set {path}: scene {content['scene']}, {seed}"]
     for split, entry in content["splits"].items():
         size = sum((path / shard).stat().st_size for shard in entry["shards"] if (path / shard).is_file())
-        cost = entry["cost"]
+        cost = entry.get("cost")
         taken = f"; solver {cost['wall_seconds']:.1f} s, set-up and compilation {cost['compile_seconds']:.1f} s" if cost else ""
         lines.append(f"  {split}: {entry['ok']} of {entry['trajectories']} trajectories in {len(entry['shards'])} shards, {size / 1e6:.1f} MB{taken}")
         lines += [f"    failed: {failure['index']} (seed {failure['seed']}): {failure['status']}" for failure in entry["failed"]]
@@ -67,11 +67,10 @@ def _shard_text(path: Path) -> str:
     with ShardReader(path) as reader:
         for index in reader.indices():
             meta, (frames, particles, dim) = reader.meta(index), reader.shape(index)
-            scene = meta["scene"].get("name") if isinstance(meta["scene"], dict) else None
             simulator = meta["simulator"].get("name") if isinstance(meta["simulator"], dict) else None
             lines.append(
                 f"  {index:06d}: {frames} frames of {meta['frame_step']:.4g} s, {particles} particles, {dim}D, "
-                f"scene {scene}, by {simulator}, seed {meta['seed']}, {meta['status']}"
+                f"scene {meta['scene'].get('name')}, by {simulator}, seed {meta['seed']}, {meta['status']}"
             )
     return "\n".join(lines)
 
@@ -111,6 +110,8 @@ def _trajectory_fault(trajectory: Trajectory) -> str | None:
     outside = ((trajectory.position < lower) | (trajectory.position > upper)).any(axis=(1, 2))
     if outside.any():
         return f"a particle outside the box in frame {np.argmax(outside)}"
+    if trajectory.context is not None and not np.isfinite(trajectory.context).all():
+        return "non-finite context"
     for name, values in trajectory.diagnostics.items():
         if values.shape != (len(trajectory.position),) or not np.isfinite(values).all():
             return f"diagnostics/{name} is not one finite number a frame"
@@ -140,13 +141,8 @@ def _dataset_faults(path: Path) -> Iterator[str]:
         return
     for split, entry in content["splits"].items():
         where = f"{path}/dataset.json: splits.{split}"
-        try:
-            shards = [path / shard for shard in entry["shards"]]
-            failed = {failure["index"]: failure["seed"] for failure in entry["failed"]}
-            count = int(entry["trajectories"])
-        except (KeyError, TypeError, ValueError):
-            yield f"{where}: incomplete; generate the data set again"
-            continue
+        shards = [path / shard for shard in entry["shards"]]
+        failed, count = {failure["index"]: failure["seed"] for failure in entry["failed"]}, entry["trajectories"]
         sound = True
         seeds = dict(failed)
         for shard in shards:

@@ -22,7 +22,7 @@ from scipy.spatial import ConvexHull, cKDTree
 
 from sim.container import Container, ContainerFamily
 from sim.errors import InputError
-from sim.fields import Finite, Friction, Positive, Range
+from sim.fields import Finite, Friction, Positive, Range, entries
 from sim.fields import Strict as _Strict
 from sim.fields import mistake as _mistake
 from sim.fields import sample as _sample
@@ -773,8 +773,16 @@ def _merged(base: dict, change: dict) -> dict:
     return result
 
 
+_JSON_TAGS = {f"tag:yaml.org,2002:{kind}" for kind in ("null", "bool", "int", "float", "str", "seq", "map")}
+
+
 class _UniqueKeyLoader(yaml.SafeLoader):
-    """Refuses duplicate keys, which plain YAML loaders silently let win."""
+    """Refuses duplicate keys, which plain YAML loaders silently let win, and knows what JSON knows: no dates, bytes, sets."""
+
+    yaml_constructors = {tag: make for tag, make in yaml.SafeLoader.yaml_constructors.items() if tag is None or tag in _JSON_TAGS}
+    yaml_implicit_resolvers = {
+        first: [entry for entry in entries if entry[0] in _JSON_TAGS] for first, entries in yaml.SafeLoader.yaml_implicit_resolvers.items()
+    }
 
 
 def _unique_mapping(loader: yaml.SafeLoader, node: yaml.MappingNode, deep: bool = False) -> dict:
@@ -792,18 +800,29 @@ def _unique_mapping(loader: yaml.SafeLoader, node: yaml.MappingNode, deep: bool 
 _UniqueKeyLoader.add_constructor(yaml.resolver.BaseResolver.DEFAULT_MAPPING_TAG, _unique_mapping)
 
 
+#: Longer than this in characters, or than this in entries once its aliases are followed, a file is no configuration but a slip or a bomb.
+_MOST_CHARACTERS, _MOST_ENTRIES = 1 << 18, 1 << 16
+
+
 def read_yaml(path: str | Path) -> Any:
-    """Read a YAML file with the safe loader, duplicate keys refused; raises ``InputError``."""
+    """Read a YAML file with the safe loader; duplicate keys, and files too long to be configurations, are refused. Raises ``InputError``."""
     try:
-        text = Path(path).read_text(encoding="utf-8")
+        with open(path, encoding="utf-8") as file:
+            text = file.read(_MOST_CHARACTERS + 1)
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(path, "file", getattr(error, "strerror", None) or "not text", "give a readable YAML file") from None
+    if len(text) > _MOST_CHARACTERS:
+        raise InputError(path, "file", f"{text[:20]}...", f"longer than {_MOST_CHARACTERS} characters; give a configuration")
     try:
-        return yaml.load(text, _UniqueKeyLoader)  # noqa: S506 (a SafeLoader)
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        content = yaml.load(text, _UniqueKeyLoader)  # noqa: S506 (a SafeLoader)
+    except (yaml.YAMLError, ValueError, LookupError, RecursionError) as error:  # a tag and no value under it is a LookupError
         mark = getattr(error, "problem_mark", None)
         place, fault = f"line {mark.line + 1}" if mark else "file", getattr(error, "problem", None) or str(error)
         raise InputError(path, place, fault, "not valid YAML; correct the line") from None
+    if (count := entries(content)) > _MOST_ENTRIES:
+        remedy = "aliases (*name) make it longer than any configuration, or hold themselves; write out what they stand for"
+        raise InputError(path, "file", f"{count:.3g} entries", remedy)
+    return content
 
 
 def explain_validation(error: ValidationError, where: object) -> InputError:

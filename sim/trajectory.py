@@ -32,6 +32,8 @@ FORMAT_VERSION = 1
 #: elastic and snow are ours.
 PARTICLE_TYPES = {"rigid": 0, "elastic": 1, "boundary": 3, "water": 5, "sand": 6, "goop": 7, "snow": 8}
 KINEMATIC_TYPE = PARTICLE_TYPES["boundary"]
+#: Float32 ends at 3e38: with larger numbers than this one nothing can be computed.
+LARGEST = 1e30
 
 
 @dataclass(frozen=True)
@@ -217,6 +219,25 @@ def _check(condition: bool, path: Path, key: str, value: object, remedy: str) ->
 _DAMAGE = (OSError, KeyError, RuntimeError, TypeError, ValueError, AttributeError, MemoryError, OverflowError)
 
 
+#: Deflate packs at most 1032 to 1; a file that promises more would fill the memory before it turned out to be damaged.
+MOST_PACKED = 1100
+
+
+def stored(path: Path, file: h5py.File, name: str) -> h5py.Dataset:
+    """A data set that lies in this file and can hold what it promises; anything else is an ``InputError``.
+
+    HDF5 could as well point to any other file of the machine.
+    """
+    parts = name.split("/")
+    links = [file.get("/".join(parts[: k + 1]), getlink=True) for k in range(len(parts))]
+    dataset = file.get(name) if all(isinstance(link, h5py.HardLink) for link in links) else None
+    if not isinstance(dataset, h5py.Dataset) or dataset.external or dataset.is_virtual or dataset.shape is None:
+        raise InputError(path, name, str(dataset), "must be a data set within the file")
+    if dataset.nbytes > MOST_PACKED * dataset.id.get_storage_size():
+        raise InputError(path, name, f"{dataset.dtype} {list(dataset.shape)}", "promises more than it holds; copy the file again")
+    return dataset
+
+
 class ShardReader:
     """Lazy reader of one shard; windows are read from disk on demand. Safe on damaged files: every fault is an ``InputError``.
 
@@ -274,15 +295,16 @@ class ShardReader:
         """Trajectory indices in the shard, ascending."""
         with self._reading("groups"):
             names = list(self.file.keys())
-        _check(all(name.isascii() and name.isdigit() for name in names), self.path, "groups", names, "group names must be trajectory indices")
+        sound = all(name.isascii() and name.isdigit() and len(name) < 19 for name in names)
+        _check(sound, self.path, "groups", names, "group names must be trajectory indices")
         return sorted(int(name) for name in names)
 
     def _group(self, index: int) -> h5py.Group:
         name = f"{index:06d}"
         with self._reading(name):
             if name in self.file:
-                group = self.file[name]
-                _check(isinstance(group, h5py.Group), self.path, name, str(group), "must be a group; generate the shard again")
+                group = self.file[name] if isinstance(self.file.get(name, getlink=True), h5py.HardLink) else None
+                _check(isinstance(group, h5py.Group), self.path, name, str(group), "must be a group within the file; generate the shard again")
                 return group
         raise InputError(self.path, "trajectory", index, f"the shard holds {self.indices()}")
 
@@ -292,23 +314,24 @@ class ShardReader:
             group = self._group(index)
             with self._reading(f"{index:06d}"):
                 meta = json.loads(group.attrs["meta"])
-                position, kinds = group["position"], group["particle_type"]
+                position, kinds = (stored(self.path, self.file, f"{index:06d}/{name}") for name in ("position", "particle_type"))
                 bounds = np.asarray(meta["bounds"], float)
                 numbers = [float(meta["frame_step"]), float(meta["radius"])]
                 meta["seed"] = None if meta["seed"] is None else int(meta["seed"])
                 meta["simulator"], str(meta["status"])
-                axes = meta["scene"].get("periodic", []) if isinstance(meta["scene"], dict) else []
-            shape = getattr(position, "shape", None)
-            remedy = "must be float32 [frames, particles, 2 or 3]"
-            sound = isinstance(position, h5py.Dataset) and len(shape) == 3 and position.dtype == np.float32 and shape[2] in (2, 3)
-            _check(sound, self.path, f"{index:06d}/position", shape, remedy)
-            sound = isinstance(kinds, h5py.Dataset) and kinds.shape == (shape[1],)
-            _check(sound, self.path, f"{index:06d}/particle_type", getattr(kinds, "shape", None), "must have one entry per particle")
-            sound = bounds.shape == (shape[2], 2) and bool((bounds[:, 0] < bounds[:, 1]).all())
-            _check(sound, self.path, f"{index:06d}/bounds", meta["bounds"], "must be [dim][lower, upper] with lower < upper")
+                _check(isinstance(meta["scene"], dict), self.path, f"{index:06d}/scene", meta["scene"], "must be a mapping; generate the shard again")
+                axes = meta["scene"].get("periodic", [])
+                shape, form = position.shape, f"{kinds.dtype} {list(kinds.shape)}"
+            sound = len(shape) == 3 and position.dtype == np.float32 and shape[2] in (2, 3) and min(shape) > 0
+            _check(sound, self.path, f"{index:06d}/position", f"{position.dtype} {list(shape)}", "must be float32 [frames, particles, 2 or 3]")
+            sound = kinds.shape == (shape[1],) and kinds.dtype.kind in "iu"
+            _check(sound, self.path, f"{index:06d}/particle_type", form, "must have one integer per particle")
+            sound = bounds.shape == (shape[2], 2) and bool((bounds[:, 0] < bounds[:, 1]).all()) and np.abs(bounds).max() < LARGEST
+            _check(sound, self.path, f"{index:06d}/bounds", meta["bounds"], "must be finite, [dim][lower, upper] with lower < upper")
             sound = isinstance(axes, list) and all(axis in list(periodic.AXES[: shape[2]]) for axis in axes)
             _check(sound, self.path, f"{index:06d}/scene.periodic", axes, f"must be a list of axes among {', '.join(periodic.AXES[: shape[2]])}")
-            _check(numbers[0] > 0 and numbers[1] > 0, self.path, f"{index:06d}/frame_step, radius", numbers[:2], "must be positive")
+            sound = all(0 < number < LARGEST for number in numbers)
+            _check(sound, self.path, f"{index:06d}/frame_step, radius", numbers, "must be positive and finite")
             self._meta[index] = meta
         return self._meta[index]
 
@@ -338,13 +361,22 @@ class ShardReader:
         """[frames, c] float32, or None."""
         group = self._group(index)
         with self._reading(f"{index:06d}/context"):
-            return group["context"][:] if "context" in group else None
+            if "context" not in group:
+                return None
+            context = stored(self.path, self.file, f"{index:06d}/context")
+            sound = context.ndim == 2 and len(context) == self.shape(index)[0] and context.shape[1] > 0 and context.dtype.kind == "f"
+            _check(sound, self.path, f"{index:06d}/context", f"{context.dtype} {list(context.shape)}", "must be floats [frames, c]")
+            return context[:]
 
     def diagnostics(self, index: int) -> dict[str, np.ndarray]:
         """Name -> [frames] float64."""
         group = self._group(index)
         with self._reading(f"{index:06d}/diagnostics"):
-            return {name: group["diagnostics"][name][:] for name in group["diagnostics"]} if "diagnostics" in group else {}
+            found = {name: stored(self.path, self.file, f"{index:06d}/diagnostics/{name}") for name in group.get("diagnostics", ())}
+            for name, values in found.items():
+                sound = values.ndim == 1 and values.dtype.kind in "fiu"
+                _check(sound, self.path, f"{index:06d}/diagnostics/{name}", f"{values.dtype} {list(values.shape)}", "must be numbers [frames]")
+            return {name: values[:] for name, values in found.items()}
 
     def read(self, index: int) -> Trajectory:
         """The whole trajectory."""

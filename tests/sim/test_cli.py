@@ -182,7 +182,7 @@ FAULTS = {
     "statistics": (lambda data: set_in(data, "statistics", "neighbours", value=1.0), "statistics: do not match"),
     "counts": (lambda data: set_in(data, "splits", "valid", "trajectories", value=5), "2 trajectories found, 5 promised"),
     "seed": (lambda data: set_in(data, "seed", value=4), "not the one its index gives"),
-    "entry": (lambda data: set_in(data, "splits", "test", "failed", value=None), "splits.test: incomplete"),
+    "entry": (lambda data: set_in(data, "splits", "test", "failed", value=None), "splits.test.failed = None: missing"),
     "version": (lambda data: set_in(data, "format_version", value=7), "format_version = 7"),
 }
 

@@ -252,55 +252,6 @@ def test_unreadable_files(tmp_path):
         SceneFamily.load(tmp_path / "binary.yaml")
 
 
-def paths_of(content, prefix=()):
-    """Every place in nested dicts and lists."""
-    items = content.items() if isinstance(content, dict) else enumerate(content) if isinstance(content, list) else ()
-    for key, value in items:
-        yield (*prefix, key)
-        yield from paths_of(value, (*prefix, key))
-
-
-JUNK = st.one_of(
-    st.none(), st.booleans(), st.integers(-3, 5), st.sampled_from([10**30, -(10**30), 1e-300, 1e300, float("nan"), float("inf"), -0.0]),
-    st.floats(-2, 2), st.text(max_size=5), st.sampled_from(["sand", "water", "box", "sticky", "1e5"]),
-    st.lists(st.floats(allow_nan=True), max_size=4), st.dictionaries(st.text(max_size=4), st.integers(), max_size=2),
-)
-
-
-@settings(max_examples=150, deadline=None, suppress_health_check=list(HealthCheck))
-@given(data=st.data())
-def test_mutated_files_raise_only_input_errors(data, tmp_path_factory):
-    """Replace, remove or add up to three entries anywhere; whatever is read, it loads and samples, or is an InputError."""
-    content = copy.deepcopy(BASE)
-    for _ in range(data.draw(st.integers(1, 3))):
-        where = data.draw(st.sampled_from(list(paths_of(content))))
-        target = content
-        for key in where[:-1]:
-            target = target[key]
-        action = data.draw(st.sampled_from(["replace", "remove", "add"]))
-        if action == "replace":
-            target[where[-1]] = data.draw(JUNK)
-        elif action == "remove":
-            del target[where[-1]]
-        elif isinstance(target, dict):
-            target[data.draw(st.text(max_size=6))] = data.draw(JUNK)
-        else:
-            target.append(data.draw(JUNK))
-        if not content:
-            break
-    path = tmp_path_factory.getbasetemp() / "mutated.yaml"
-    path.write_text(yaml.safe_dump(content, allow_unicode=True), encoding="utf-8")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("sim.scene._TRIES", 3)
-        try:
-            scene = SceneFamily.load(path).sample(0)
-            if scene.spacing > 0.003:
-                particles = scene.particles()
-                assert np.isfinite(particles.position).all() and len(particles.position)
-        except InputError as error:
-            assert "\n" not in str(error) and str(path) in str(error)
-
-
 @settings(max_examples=100, deadline=None, suppress_health_check=list(HealthCheck))
 @given(text=st.text(alphabet=st.sampled_from("ab:-[]{}#&*!|>'\"%@`,? \n\t01.e\x00é"), max_size=40))
 def test_arbitrary_text_raises_only_input_errors(text, tmp_path_factory):

@@ -1,17 +1,27 @@
 """Studies: the shipped ones are sound and resolve; every mistake is one line with file, key, value and remedy, and nothing is written."""
 
 import json
+import re
+import sys
+import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 from study_tree import ROOT, make_tree, planned, snakemake
 
-from sim.errors import InputError
-from sim.scene import SceneFamily
-from sim.stability import CASES
-from workflow.results import trained_on
-from workflow.study import load_study
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from mutations import spoil_yaml  # noqa: E402
+
+from sim.errors import InputError  # noqa: E402
+from sim.scene import SceneFamily  # noqa: E402
+from sim.stability import CASES  # noqa: E402
+from workflow.results import trained_on  # noqa: E402
+from workflow.study import load_study  # noqa: E402
+
+STUDIES = list((ROOT / "configs" / "studies").glob("*.yaml"))
 
 
 @pytest.fixture(scope="module")
@@ -133,6 +143,37 @@ def test_files_that_are_no_study(place, monkeypatch, text):
     path = Path("configs/studies/odd.yaml")
     path.write_text(text)
     with pytest.raises(InputError, match="odd.yaml"):
+        load_study(path)
+
+
+def test_mutated_studies(place, monkeypatch):
+    """Five mutations of every shipped study: it resolves, or one line names file, key, value and remedy; nothing is run and nothing written."""
+    monkeypatch.chdir(place)
+    before = sorted(path for path in place.rglob("*") if "__pycache__" not in path.parts)
+    outcomes = []
+    for trial, source in enumerate(5 * sorted(STUDIES)):
+        path, rng = Path("configs/studies") / source.name, np.random.default_rng([6, trial])
+        path.write_bytes(spoil_yaml(source.read_text(), rng, place / "mark"))
+        begun = time.process_time()
+        try:
+            load_study(path)
+            outcomes.append("")
+        except InputError as error:
+            outcomes.append(str(error))
+            assert re.fullmatch(r"\S+: \S.* = .+: .+", outcomes[-1]) and len(outcomes[-1]) < 2000
+        assert time.process_time() - begun < 10
+        path.write_bytes(source.read_bytes())
+    assert sorted(path for path in place.rglob("*") if "__pycache__" not in path.parts) == before
+    assert outcomes.count("") > 0 and len(outcomes) - outcomes.count("") > 20
+
+
+def test_aliases_that_grow_without_end(place, monkeypatch):
+    """The schema's own messages hold what they refuse, so it must not get that far."""
+    monkeypatch.chdir(place)
+    path = Path("configs/studies/odd.yaml")
+    path.write_text("\n".join(["a0: &a0 [x, x, x, x, x, x, x, x, x]", *(f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 9)}]" for k in range(1, 12)),
+                               "title: *a11"]))  # fmt: skip
+    with pytest.raises(InputError, match="odd.yaml: file = '.* entries': aliases"):
         load_study(path)
 
 
