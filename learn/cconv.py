@@ -59,12 +59,14 @@ WALL_SPACING = 0.5 * math.sqrt(math.pi / 1.9)
 CROWD = 40 / (4 / 3 * math.pi * 2.25**3)
 #: Added to squared errors in units of s^2, under the root: 1e-9 m^2 at the original's s = 1 / 128 m.
 SOFTENING = 1e-9 * 128**2
+#: More of them on a wall than this come of a wrong spacing, and would exhaust the memory.
+MOST_WALL_PARTICLES = 10**7
 
 
 class Settings(BaseModel):
     """Options of a CConv; the defaults are the paper's."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     channels: tuple[PositiveInt, ...] = Field((32, 64, 64), min_length=1)  # c_0 (the second layer's input is three times as wide), c_1, ...
     kernel: int = Field(4, ge=2)  # K, cells of a filter along each axis
@@ -105,6 +107,15 @@ def ball_to_cube(x: Tensor) -> Tensor:
     return torch.cat([disc_to_square(plane * widen[:, None]), height[:, None]], 1)
 
 
+def wall_counts(extent: np.ndarray, spacing: float) -> np.ndarray:
+    """Particles along each edge of a box of lengths ``extent``, [dim] int; ``InputError`` for more of them on a wall than memory holds."""
+    counts = np.maximum(np.round(extent / spacing), 1)
+    if not counts.prod() / counts.min() <= MOST_WALL_PARTICLES:
+        shown = " x ".join(f"{count:g}" for count in counts)
+        raise InputError("cconv", "spacing", spacing, f"{shown} particles along the walls of the box; train on data of another spacing")
+    return counts.astype(int)
+
+
 def wall_particles(bounds: np.ndarray, spacing: float, period: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Positions and inward unit normals, both [particles, dim], on the walls of a box, about ``spacing`` apart, none on an edge.
 
@@ -112,7 +123,7 @@ def wall_particles(bounds: np.ndarray, spacing: float, period: np.ndarray | None
     """
     bounds = np.asarray(bounds, float)
     extent = bounds[:, 1] - bounds[:, 0]
-    counts = np.maximum(np.round(extent / spacing), 1).astype(int)
+    counts = wall_counts(extent, spacing)
     axes = [low + (np.arange(count) + 0.5) * length / count for low, count, length in zip(bounds[:, 0], counts, extent, strict=True)]
     positions, normals = [np.empty((0, len(bounds)))], [np.empty((0, len(bounds)))]
     walled = [axis for axis in range(len(bounds)) if period is None or not period[axis]]
@@ -227,7 +238,8 @@ class ContinuousConv(nn.Module):
 
     def __init__(self, inputs: int, outputs: int, cells: int):
         super().__init__()
-        self.weight = nn.Parameter(torch.empty(inputs, cells, outputs).uniform_(-0.05, 0.05))
+        self.weight = nn.Parameter(torch.empty(inputs, cells, outputs))
+        nn.init.uniform_(self.weight, -0.05, 0.05)
         self.bias = nn.Parameter(torch.zeros(outputs))
 
     def forward(self, features: Tensor, pairs: Pairs) -> Tensor:
@@ -293,6 +305,7 @@ class CConv(nn.Module):
         self.options, self.settings, self.spec = settings, settings.model_dump(mode="json"), spec
         self.history = spec.stride + 1
         self.radius = settings.radius * spec.spacing
+        wall_counts(np.ptp(spec.bounds, axis=1), WALL_SPACING * spec.spacing)  # now, not when a rollout begins
         ball = {2: math.pi, 3: 4 / 3 * math.pi}[spec.dim] * settings.radius**spec.dim
         self.crowd = CROWD * ball
         step = spec.frame_step * spec.stride

@@ -10,19 +10,28 @@ import hashlib
 import io
 import json
 import warnings
+import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeVar
 
 import torch
 from pydantic import BaseModel, ValidationError
 from torch import nn
+from torch.nn.modules.module import register_module_parameter_registration_hook
 
 from learn.dataset import DataSpec
 from learn.model import MODELS, build
 from sim.errors import InputError
+from sim.fields import entries
 from sim.trajectory import atomic_path
 
 FORMAT_VERSION = 1
+#: What stands beside the tensors of a file.
+PLAIN_KEYS = ("settings", "spec", "provenance", "config", "sampler", "progress")
+#: Larger models are slips of the keyboard: they would exhaust memory or time before anything could say so.
+MOST_PARAMETERS, MOST_TENSORS, MOST_ENTRIES = 10**9, 20_000, 10**6
 MODEL_FORMAT, STATE_FORMAT = "sluice-model", "sluice-training-state"
 
 Checked = TypeVar("Checked", bound=BaseModel)
@@ -60,7 +69,14 @@ def read_content(path: str | Path, device: torch.device | str, form: str, remedy
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            return torch.load(path, map_location=device, weights_only=True)
+            if zipfile.is_zipfile(path):
+                with zipfile.ZipFile(path) as archive:
+                    if sum(entry.file_size for entry in archive.infolist()) > path.stat().st_size:
+                        raise ValueError("it promises more than it holds")
+            content = torch.load(path, map_location=device, weights_only=True)
+        if (count := entries(content)) > MOST_ENTRIES:
+            raise ValueError(f"its parts refer to each other, {count:.3g} entries in all")
+        return content
     # What a damaged or hostile file raises is open-ended (zip, pickle, storage and type errors); all of it is a bad file.
     except Exception as error:
         reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
@@ -80,6 +96,11 @@ def _read(path: str | Path, form: str, keys: dict[str, type], device: torch.devi
     for key, kind in expected.items():
         if not isinstance(content[key], kind):
             raise InputError(path, key, type(content[key]).__name__, f"must be of type {kind.__name__}; {remedy}")
+        if key in PLAIN_KEYS:
+            try:
+                json.dumps(content[key])
+            except (TypeError, ValueError, RecursionError) as error:
+                raise InputError(path, key, str(error), f"must be numbers and texts; {remedy}") from None
     return content
 
 
@@ -104,23 +125,43 @@ def read_model_file(path: str | Path, device: torch.device | str = "cpu") -> dic
     return _read(path, MODEL_FORMAT, keys, device, "copy the file again or train again")
 
 
-def build_model(name: str, settings: dict, spec: DataSpec, where: object) -> nn.Module:
-    """A freshly initialised registered model; unknown names and impossible settings are ``InputError`` of file ``where``."""
+def build_model(name: str, settings: dict, spec: DataSpec, where: object, most: int = MOST_PARAMETERS) -> nn.Module:
+    """A freshly initialised registered model of at most ``most`` parameters; an ``InputError`` of file ``where`` if it is unknown or cannot be."""
     if name not in MODELS:
         raise InputError(where, "model", name, f"must be one of {', '.join(sorted(MODELS))}")
     try:
-        return build(name, settings, spec, where)
+        with _bounded(most):
+            return build(name, settings, spec, where)
     except InputError:
         raise
-    except (RuntimeError, ValueError, TypeError, OverflowError, MemoryError) as error:  # torch reports impossible sizes in all these ways
+    except (RuntimeError, ValueError, TypeError, ArithmeticError, MemoryError) as error:  # torch reports impossible sizes in all these ways
         raise InputError(where, "settings", settings, f"no {name} can be built from this: {error}") from None
+
+
+@contextmanager
+def _bounded(most: int) -> Iterator[None]:
+    """Stops the construction of a model of more than ``most`` parameters, before memory is written, or of more tensors than time allows."""
+    numbers = tensors = 0
+
+    def count(_: nn.Module, name: str, parameter: nn.Parameter | None) -> None:
+        nonlocal numbers, tensors
+        numbers, tensors = numbers + (0 if parameter is None else parameter.numel()), tensors + 1
+        if numbers > most or tensors > MOST_TENSORS:
+            raise MemoryError(f"it has more than {most} parameters, or more than {MOST_TENSORS} tensors of them")
+
+    hook = register_module_parameter_registration_hook(count)
+    try:
+        yield
+    finally:
+        hook.remove()
 
 
 def load_model(path: str | Path, device: torch.device | str = "cpu") -> nn.Module:
     """The model of a model file, on ``device``, in evaluation mode. Runs no code from the file; every fault of it is an ``InputError``."""
     path = Path(path)
     content = read_model_file(path, "cpu")
-    model = build_model(content["model"], content["settings"], DataSpec.from_dict(content["spec"], path), path)
+    # A number takes four bytes: what has more parameters than the file has room for is not built only to be refused.
+    model = build_model(content["model"], content["settings"], DataSpec.from_dict(content["spec"], path), path, path.stat().st_size // 4)
     load_weights(model, content["state_dict"], path)
     return model.to(device).eval()
 

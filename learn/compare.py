@@ -22,8 +22,9 @@ import numpy as np
 
 from learn import metrics
 from sim import periodic
+from sim.errors import InputError
 from sim.simulator import Rollout, SimulationError, Simulator, Start, rollout, start_from
-from sim.trajectory import Trajectory
+from sim.trajectory import KINEMATIC_TYPE, Trajectory
 
 #: Kinds that a learned model is a rival of: the solver ladder and its most expensive rung, the solver that made the truth.
 SOLVERS = ("solver", "reference")
@@ -182,7 +183,7 @@ def compare(contenders: Sequence[Simulator], trajectories: Sequence[Trajectory],
     """One row per scene and contender: medians over trajectories (and training seeds), means, spread, curves. Failures are rows.
 
     Every contender gets the same known frames and predicts all the rest of each trajectory. Contenders of one name are one row and must
-    differ in ``settings["seed"]`` alone (repeated trainings); ``ValueError`` otherwise, and for trajectories without frames to predict.
+    differ in ``settings["seed"]`` alone (repeated trainings); ``ValueError`` otherwise, ``InputError`` for trajectories without frames to predict.
     ``seconds_per_frame`` comes from these rollouts until ``attach_timing`` brings interleaved figures.
     """
     history = known_frames(contenders, settings)
@@ -196,8 +197,13 @@ def compare(contenders: Sequence[Simulator], trajectories: Sequence[Trajectory],
     scenes: dict[str, list[Trajectory]] = {}
     for trajectory in trajectories:
         if len(trajectory.position) <= history:
-            raise ValueError(f"trajectory of seed {trajectory.seed}: {len(trajectory.position)} frames: needs more than the {history} known ones")
-        scenes.setdefault(trajectory.scene["name"], []).append(trajectory)
+            remedy = f"needs more than the {history} known ones; give longer trajectories"
+            raise InputError(f"trajectory of seed {trajectory.seed}", "frames", len(trajectory.position), remedy)
+        if not trajectory.moving.any():
+            raise InputError(f"trajectory of seed {trajectory.seed}", "particle_type", KINEMATIC_TYPE, "nothing in it moves; give another one")
+        if not isinstance(name := trajectory.scene.get("name"), str):
+            raise InputError(f"trajectory of seed {trajectory.seed}", "scene.name", name, "needs a name, which tells the rows of scenes apart")
+        scenes.setdefault(name, []).append(trajectory)
     rows = []
     for scene, tests in scenes.items():
         for group in groups.values():

@@ -33,12 +33,12 @@ TYPE_SLOTS = 9
 class DataSettings(BaseModel):
     """How windows are drawn from a data set."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     stride: int = Field(1, ge=1)  # file frames from one frame of a window to the next
     mirror: bool = False  # flip half of the windows about the box centre, along every axis that gravity does not mark
     # Leave out windows at rest: after the first motion, no particle faster than this share of |velocity std|.
-    skip_rest: float = Field(0.0, ge=0, allow_inf_nan=False)
+    skip_rest: float = Field(0.0, ge=0)
 
 
 def _tuple(value: object) -> object:

@@ -48,7 +48,7 @@ NORM_EPSILON = 1e-5
 class Settings(BaseModel):
     """Options of a GNS; the defaults are the paper's."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     latent: int = Field(128, ge=1)  # width of all hidden layers and latents
     hidden_layers: int = Field(2, ge=1)  # hidden layers of every MLP
@@ -62,7 +62,7 @@ class Settings(BaseModel):
     self_edges: bool = True  # every particle also sends to itself
     radius: float | None = Field(None, gt=0)  # connectivity radius in particle spacings; None: the data's
     wall_distance: float | None = Field(None, gt=0)  # clamp of the wall distances in particle spacings; None: the connectivity radius
-    noise: float = Field(0.3, ge=0)  # sigma of the last velocity's noise (the paper's 6.7e-4 is .25-.5 of its velocity std)
+    noise: float = Field(0.3, ge=0, le=1e6)  # sigma of the last velocity's noise (the paper's 6.7e-4 is .25-.5 of its velocity std)
     noise_unit: Literal["velocity_std", "absolute"] = "velocity_std"  # of ``noise``: rms velocity std over the axes, or length / model frame
     noise_scheme: NoiseScheme = "random_walk"  # see learn.features.velocity_noise
     ballistic: bool = False  # predictions start from gravity * dt^2 instead of the mean acceleration

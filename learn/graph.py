@@ -86,12 +86,12 @@ def radius_graph(
 
     position [particles, dim], length; radius: length; example [particles], ascending: pairs join only within one example (None: there
     is one); self_edges: every particle also sends to itself; period [dim] of a periodic box: distances are those of nearest images. They are
-    taken in float64 of the given positions. Raises ``ValueError`` on a position that is not finite.
+    taken in float64 of the given positions. Raises ``FloatingPointError`` on a position that is not finite.
     """
     points = position.detach().cpu().numpy().astype(np.float64)
     count = len(points)
     if not np.isfinite(points).all():
-        raise ValueError("radius_graph: a position is not finite")
+        raise FloatingPointError("radius_graph: a position is not finite")
     if example is None:
         bounds = np.array([0, count])
     else:

@@ -22,12 +22,13 @@ The clip acts on the flight alone: nothing stops a wrong deviation from leaving 
 from __future__ import annotations
 
 import itertools
+import math
 from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
 import torch
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, PositiveInt, model_validator
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -40,27 +41,29 @@ from sim.simulator import Start
 from sim.trajectory import KINEMATIC_TYPE
 
 Share = Annotated[float, Field(gt=0, le=1)]
+#: Larger grids come of a wrong ``cell`` or ``margin``, and would exhaust the memory.
+MOST_NODES = 3 * 10**7
 
 
 class GridEmulatorSettings(BaseModel):
     """Options of ``GridEmulator``."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
-    frames_per_call: int = Field(8, ge=1)  # m: model frames that one network call predicts
+    frames_per_call: int = Field(8, ge=1, le=10_000)  # m: model frames that one network call predicts
     history: int = Field(2, ge=2)  # model frames of input: history - 1 velocities, the last one and their differences
     cell: float = Field(2.0, gt=0)  # H in particle spacings (rounded so that whole cells fill the box)
     margin: int = Field(2, ge=1)  # cells kept outside each wall; a particle beyond them flies ballistically, unseen
-    channels: list[int] = Field([32, 48, 64], min_length=1)  # width of each level of the U-Net, finest first; each halves the resolution
+    channels: list[PositiveInt] = Field([32, 48, 64], min_length=1)  # width of each level of the U-Net, finest first; each halves the resolution
     blocks: int = Field(1, ge=1)  # residual convolutions at each level, on the way down and again on the way up
     wall_reach: float = Field(4.0, gt=0)  # distance in cells at which the wall features saturate
-    noise: float = Field(0.02, ge=0)  # std of the last input velocity's noise in velocity stds (random walk over the history)
+    noise: float = Field(0.02, ge=0, le=1e6)  # std of the last input velocity's noise in velocity stds (random walk over the history)
     unroll: list[int] = Field([1, 2, 4], min_length=1)  # calls a training window spans; equal shares of the training
     walls: bool = True  # the flight that the network corrects stops at the walls; off: it goes through them
     preview: list[Share] = Field([0.5, 1.0], max_length=8)  # shares of a call after which the network is shown the density that flight leads to
     select: int = Field(0, ge=0)  # windows of a batch that are trained on, half of them drawn by how far they are from flight; 0: all
     relaxation: Relaxation | None = None  # of rollouts: crowded particles are pushed apart after every call, see learn.relaxation
-    floor: float = Field(0.03, gt=0)  # least scale of a frame's loss, in particle spacings: below it the loss would be all noise
+    floor: float = Field(0.03, gt=0, le=1e6)  # least scale of a frame's loss, in particle spacings: below it the loss would be all noise
 
     @model_validator(mode="after")
     def _ascending(self) -> GridEmulatorSettings:
@@ -103,7 +106,10 @@ class StencilConv(nn.Module):
 
     def __init__(self, dim: int, inputs: int, outputs: int):
         super().__init__()
-        self.weight = nn.Parameter(torch.randn(3**dim, inputs, outputs) * (2 / (3**dim * inputs)) ** 0.5)
+        # First registered, then written: a model that is too large stops there (``learn.checkpoint.build_model``).
+        self.weight = nn.Parameter(torch.empty(3**dim, inputs, outputs))
+        with torch.no_grad():
+            self.weight.normal_().mul_((2 / (3**dim * inputs)) ** 0.5)
         self.bias = nn.Parameter(torch.zeros(outputs))
 
     def forward(self, x: Tensor, neighbours: Tensor) -> Tensor:
@@ -148,6 +154,8 @@ class SparseGrid(nn.Module):
     def __init__(self, shape: list[int], levels: int):
         super().__init__()
         dim = len(shape)
+        if math.prod(shape) > MOST_NODES:
+            raise MemoryError(f"a grid of {' x '.join(map(str, shape))} nodes; enlarge cell, or lessen margin")
         self.dim, self.sizes = dim, []
         self.shape = list(shape)
         for level in range(levels):

@@ -30,11 +30,11 @@ LONGEST = 0.25
 class Relaxation(BaseModel):
     """Options of ``relax``."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
-    loops: int = Field(3, ge=1)  # steps after every call of the model
-    strength: float = Field(0.05, gt=0)  # displacement in spacings for unit pressure
-    density: float = Field(2.0, ge=1)  # number density, 1 on the lattice, above which particles repel
+    loops: int = Field(3, ge=1, le=1000)  # steps after every call of the model
+    strength: float = Field(0.05, gt=0, le=1e6)  # displacement in spacings for unit pressure
+    density: float = Field(2.0, ge=1, le=1e6)  # number density, 1 on the lattice, above which particles repel
 
 
 def relax(

@@ -27,7 +27,6 @@ from typing import Any, Literal, NoReturn
 
 import numpy as np
 import torch
-import yaml
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 from torch import Tensor, nn
 from torch.optim.adam import adam
@@ -40,6 +39,7 @@ from learn.parallel import Processes
 from learn.variants import with_variant
 from sim import __version__, periodic
 from sim.errors import InputError, RunError
+from sim.scene import read_yaml
 from sim.simulator import rollout, start_from
 from sim.trajectory import KINEMATIC_TYPE, Trajectory, write_json, write_text
 
@@ -50,20 +50,20 @@ VALIDATION_COLUMNS = ("step", "seconds", "rollout_mse", "spacing_ratio", "finish
 class TrainSettings(BaseModel):
     """How a model is trained. Exactly one of ``steps`` and ``minutes`` is the budget."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     steps: int | None = Field(None, ge=1)  # budget in optimiser steps
-    minutes: float | None = Field(None, gt=0, allow_inf_nan=False)  # budget in minutes of wall time, validation included
+    minutes: float | None = Field(None, gt=0)  # budget in minutes of wall time, validation included
     batch: int = Field(2, ge=1)  # windows a step, of all processes together
     edges: int | None = Field(None, ge=1)  # instead of ``batch``: as many windows as have so many edges, by the data's mean neighbours
-    learning_rate: float = Field(1e-4, gt=0, allow_inf_nan=False)
-    final_learning_rate: float = Field(1e-6, ge=0, allow_inf_nan=False)  # floor of the schedule
+    learning_rate: float = Field(1e-4, gt=0)
+    final_learning_rate: float = Field(1e-6, ge=0)  # floor of the schedule
     schedule: Literal["cosine", "exponential"] = "cosine"  # over the budget; or the paper's decay over steps
     decay_steps: int = Field(5_000_000, ge=1)  # exponential only: steps in which the learning rate falls tenfold
     warmup_steps: int = Field(100, ge=0)  # steps of linear warm-up
-    gradient_clip: float | None = Field(1.0, gt=0, allow_inf_nan=False)  # largest norm of the whole gradient; null: none
+    gradient_clip: float | None = Field(1.0, gt=0)  # largest norm of the whole gradient; null: none
     optimizer: Literal["adam", "muon"] = "adam"  # the paper's; or Muon for the weight matrices, which the grid emulator learns faster with
-    weight_decay: float = Field(0.0, ge=0, allow_inf_nan=False)  # decoupled (AdamW); 0 is Adam
+    weight_decay: float = Field(0.0, ge=0)  # decoupled (AdamW); 0 is Adam
     average_decay: float = Field(0.999, ge=0, lt=1)  # of the exponential average of the weights; 0: none
     validations: int = Field(10, ge=1)  # evenly over the budget, the last at its end
     validate_every: int | None = Field(None, ge=1)  # steps; instead of ``validations``
@@ -102,7 +102,7 @@ class TrainSettings(BaseModel):
 class Config(BaseModel):
     """A file of ``configs/models/``: which model, its settings, how it is trained, how windows are drawn."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     model: str
     settings: dict = {}
@@ -117,12 +117,7 @@ def load_config(path: str | Path, overrides: dict | None = None, variant: str | 
     Every fault is an ``InputError``. The model's own settings are checked when the model is built.
     """
     path = Path(path)
-    try:
-        content = yaml.safe_load(path.read_text())
-    except OSError as error:
-        raise InputError(path, "file", error.strerror, "not readable; correct the path") from None
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError, ValueError) as error:
-        raise InputError(path, "file", str(error), "not YAML; correct it") from None
+    content = read_yaml(path)
     if not isinstance(content, dict):
         raise InputError(path, "file", type(content).__name__, "must be a mapping with the keys model, settings, training, data")
     content = with_variant(content, variant, path)
@@ -328,6 +323,7 @@ class Trainer:
         shortest = min(shape[0] for shape in self.valid_data.shapes[: self.settings.validation_trajectories])
         if shortest <= self.model.history:
             raise InputError(self.valid_data.path, "splits.valid", shortest, f"needs trajectories of more than {self.model.history} frames")
+        self.trajectories = [self.valid_data.trajectory(number) for number in range(min(self.settings.validation_trajectories, len(self.valid_data)))]
 
     def _resume(self) -> None:
         path = self.folder / "checkpoint.pt"
@@ -407,7 +403,6 @@ class Trainer:
 
             self.board = SummaryWriter(str(self.folder / "tensorboard"), purge_step=self.step)
         self._saved_at, self._printed_at = time.perf_counter(), -math.inf
-        self.trajectories = [self.valid_data.trajectory(number) for number in range(min(self.settings.validation_trajectories, len(self.valid_data)))]
         self.model.train()
         try:
             with self._signals(), self._bar():
@@ -494,7 +489,10 @@ class Trainer:
             self._show(mean, rate)
 
     def _step(self, windows: Windows, rate: float, progress: float) -> None:
-        loss = self.model.loss(windows, self.generator, progress)
+        try:
+            loss = self.model.loss(windows, self.generator, progress)
+        except FloatingPointError as error:  # a call of the model whose result the next one, of an unrolled loss, cannot begin from
+            self._diverged(str(error))
         for parameter in self.parameters:
             parameter.grad = None
         loss.backward()

@@ -8,8 +8,6 @@ from pathlib import Path
 import dummy_model
 import pytest
 import torch
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from learn.checkpoint import STATE_KEYS, file_hash, load_model, load_state, read_model_file, save_model, save_state
 from learn.dataset import Dataset, DataSpec
@@ -84,23 +82,6 @@ def test_bomb_would_have_gone_off(tmp_path: Path) -> None:
     pickle.loads(pickle.dumps(Bomb(tmp_path / "exploded")))
     assert (tmp_path / "exploded").exists()
 
-
-@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(data=st.data())
-def test_damaged_files(saved: Path, data: st.DataObject) -> None:
-    """Truncated or overwritten anywhere, a checkpoint loads or is an error of one line."""
-    raw, path = saved.read_bytes(), saved.with_name("damaged.pt")
-    if data.draw(st.booleans()):
-        path.write_bytes(raw[: data.draw(st.integers(0, len(raw) - 1))])
-    else:
-        changed = bytearray(raw)
-        for place in data.draw(st.lists(st.integers(0, len(raw) - 1), min_size=1, max_size=8)):
-            changed[place] = data.draw(st.integers(0, 255))
-        path.write_bytes(changed)
-    try:
-        load_model(path)
-    except InputError as error:
-        assert "\n" not in str(error)
 
 
 def edited(saved: Path, **changes: object) -> Path:

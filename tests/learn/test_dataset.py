@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 import pytest
 import torch
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from learn.dataset import Dataset, DataSettings, DataSpec, Sampler
@@ -239,26 +239,6 @@ def test_missing_data_set_and_split(tmp_path: Path, bounce_dataset: Path) -> Non
     with pytest.raises(InputError, match="holds test, train, valid"):
         Dataset(bounce_dataset, "validation")
 
-
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(data=st.data())
-def test_damaged_shards(copy: Path, bounce_dataset: Path, data: st.DataObject) -> None:
-    """Truncated or overwritten anywhere, a shard is readable or an error of one line, never anything else."""
-    raw = (bounce_dataset / "train" / "shard-00000.h5").read_bytes()
-    if data.draw(st.booleans()):
-        damaged = raw[: data.draw(st.integers(0, len(raw) - 1))]
-    else:
-        changed = bytearray(raw)
-        for place in data.draw(st.lists(st.integers(0, len(raw) - 1), min_size=1, max_size=8)):
-            changed[place] = data.draw(st.integers(0, 255))
-        damaged = bytes(changed)
-    (copy / "train" / "shard-00000.h5").write_bytes(damaged)
-    try:
-        dataset = Dataset(copy, "train")
-        dataset.spec(2)
-        dataset.batch(dataset.windows(3)[:4], 3)
-    except InputError as error:
-        assert "\n" not in str(error)
 
 
 def test_non_finite_positions_are_refused(copy: Path) -> None:

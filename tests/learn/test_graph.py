@@ -42,7 +42,7 @@ def test_no_cap_on_neighbours():
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
 def test_position_that_is_not_finite_is_refused(value):
-    with pytest.raises(ValueError, match="not finite"):
+    with pytest.raises(FloatingPointError, match="not finite"):
         radius_graph(torch.tensor([[0.0, 0.0], [value, 0.0]]), 1.0)
 
 
