@@ -11,7 +11,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from sim.errors import InputError, RunError
+from sim.errors import InputError, RunError, reason
 
 
 def _at_least(low: int):
@@ -60,7 +60,7 @@ def _parser() -> argparse.ArgumentParser:
     command.set_defaults(run=_validate)
     command.add_argument("path", type=Path)
 
-    command = commands.add_parser("render", help="a film (.mp4, .gif) or a still (.png) of one trajectory")
+    command = commands.add_parser("render", help="a film (.mp4) or a still (.png) of one trajectory")
     command.set_defaults(run=_render)
     command.add_argument("shard", type=Path)
     command.add_argument("--index", type=_at_least(0), help="trajectory index (default: the shard's first)")
@@ -184,8 +184,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except InputError as error:
         print(f"sluice-sim: {error}", file=sys.stderr)
         return 2
-    except RunError as error:
-        print(f"sluice-sim: {error}", file=sys.stderr)
+    except (RunError, OSError) as error:
+        print(f"sluice-sim: {reason(error) if isinstance(error, OSError) else error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt as interrupt:
         hint = "; finished shards are kept, the same command continues" if options.command == "generate" else ""

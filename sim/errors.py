@@ -11,5 +11,11 @@ class InputError(ValueError):
         super().__init__(" ".join(f"{where}: {key} = {shown}: {remedy}".split()))
 
 
+def reason(error: OSError) -> str:
+    """An operating system's error in one line: the file, if it is known, and what is wrong with it."""
+    text = " ".join(str(error.strerror or error).split())
+    return f"{error.filename}: {text}" if error.filename else text
+
+
 class RunError(RuntimeError):
     """A failure while running that is not the user's mistake (disk full, every trajectory failed): exit code 1."""

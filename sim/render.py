@@ -11,11 +11,13 @@ Missing GL libraries end a process with a segmentation fault instead of an excep
 from __future__ import annotations
 
 import math
+import re
 import subprocess
 import sys
+import tempfile
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -435,19 +437,29 @@ def render_film(
 
     count = len(panes[0].position)
     size, pictures = _pictures(panes, bounds, spacing, footers or [""] * count, columns, width, gravity, 2)
-    with atomic_path(path) as temporary:
-        writer = imageio_ffmpeg.write_frames(
-            str(temporary), size, fps=rate, codec="libx264", pix_fmt_out="yuv420p", macro_block_size=2, quality=None,
-            ffmpeg_log_level="error", output_params=["-crf", "23", "-preset", "veryfast", "-movflags", "+faststart"],
-        )  # fmt: skip
-        try:
-            writer.send(None)
-            for picture in pictures:
-                writer.send(np.ascontiguousarray(picture))
-        except OSError as error:
-            raise RunError(f"{path}: ffmpeg could not write the film: {str(error).splitlines()[0]}") from None
-        finally:
-            writer.close()
+    raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{size[0]}x{size[1]}", "-r", f"{rate:g}", "-i", "-"]
+    coded = ["-an", "-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "23", "-preset", "veryfast", "-movflags", "+faststart"]
+    # Not by imageio_ffmpeg's own writer: it takes no notice of ffmpeg's exit code, and a full disk would leave half a film as a whole one.
+    with atomic_path(path) as temporary, tempfile.TemporaryFile() as said:
+        command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-v", "error", *raw, *coded, str(temporary)]
+        with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=said, start_new_session=True) as ffmpeg:
+            try:
+                with suppress(BrokenPipeError):  # it ended early; its exit code tells
+                    for picture in pictures:
+                        ffmpeg.stdin.write(np.ascontiguousarray(picture))
+                    ffmpeg.stdin.close()
+                failed = ffmpeg.wait()
+            except BaseException:
+                ffmpeg.kill()
+                raise
+            finally:
+                with suppress(BrokenPipeError):
+                    ffmpeg.stdin.close()
+        if failed:
+            said.seek(0)
+            lines = said.read().decode(errors="replace").splitlines() or [f"exit code {failed}"]
+            why = re.sub(r"^\[.*?\] ", "", lines[0])  # without the part of ffmpeg that says so
+            raise RunError(f"{path}: ffmpeg could not write the film: {why}")
 
 
 def render_still(

@@ -84,7 +84,10 @@ def flush(path: str | Path) -> None:
 
 @contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
-    """Yield a temporary name; on success flush to disk and rename to ``path``; on any error remove it. Complete or absent."""
+    """Yield a temporary name; on success flush to disk and rename to ``path``; on any error remove it. Complete or absent.
+
+    A write that fails (a full disk) is an ``OSError`` that names ``path``, which the operating system's own does not.
+    """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp{path.suffix}")
@@ -92,6 +95,10 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         yield temporary
         flush(temporary)
         os.replace(temporary, path)
+    except OSError as error:
+        if error.errno is not None and str(error.filename) in ("None", str(temporary)):
+            error.filename, error.filename2 = str(path), None
+        raise
     finally:
         temporary.unlink(missing_ok=True)
 

@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 import time
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -14,16 +13,20 @@ import pytest
 import yaml
 
 HERE = Path(__file__).parent
-sys.path.insert(0, str(HERE))  # worker processes inherit it
+sys.path[:0] = [str(HERE), str(HERE.parent), str(HERE.parent / "learn")]  # worker processes inherit it
 
+from bouncing import bounce  # noqa: E402
+from disks import mounted, small_disk  # noqa: E402
 from fake_teacher import POISON_FRAME, POISON_PARTICLE, POISONS, FakeTeacher, poisoned  # noqa: E402
 from tiny import family, hidden, shards, without_cost  # noqa: E402
 
+from sim import render  # noqa: E402
+from sim.cli import main  # noqa: E402
 from sim.errors import InputError, RunError  # noqa: E402
 from sim.generate import generate  # noqa: E402
 from sim.info import faults  # noqa: E402
 from sim.scene import SceneFamily  # noqa: E402
-from sim.trajectory import ShardReader  # noqa: E402
+from sim.trajectory import ShardReader, write_shard  # noqa: E402
 
 #: Water and sand thrown at a ball on the floor.
 MIXED = {
@@ -133,19 +136,6 @@ def test_spoilt_numbers_are_named_and_spoil_nothing_else(tmp_path, capfd, change
 # -- disks
 
 
-@contextmanager
-def mounted(folder, *options):
-    """What ``mount`` makes of a folder; skipped where it may not."""
-    folder.mkdir(exist_ok=True)
-    done = subprocess.run(["mount", *options, str(folder)], capture_output=True, text=True)
-    if done.returncode:
-        pytest.skip(f"mounting is not possible here: {done.stderr.strip()}")
-    try:
-        yield
-    finally:
-        subprocess.run(["umount", str(folder)], check=True)
-
-
 @pytest.fixture(scope="module")
 def reference(tmp_path_factory):
     """Six trajectories in six shards."""
@@ -173,6 +163,27 @@ def test_disk_full(tmp_path, reference):
         subprocess.run(["mount", "-o", "remount,size=10m", str(disk)], check=True)
         generate(family(), {"train": 6}, folder, shard_size=1, teacher=FakeTeacher)
         assert shards(folder) == expected and without_cost(folder) == without_cost(reference)
+
+
+@pytest.mark.parametrize("name", ["film.mp4", "still.png"])
+@pytest.mark.filterwarnings("ignore:no OpenGL here:RuntimeWarning")
+def test_pictures_on_a_full_disk(tmp_path, capfd, monkeypatch, name):
+    """One line and no half picture, wherever the disk fills up; with room, the bytes of one that had room."""
+    monkeypatch.setattr(render, "gl_works", lambda: False)
+    disk, shard, whole = tmp_path / "disk", tmp_path / "shard.h5", tmp_path / name
+    write_shard(shard, {0: bounce(0, 100, 8)})
+    assert main(["render", str(shard), "--out", str(whole)]) == 0
+    capfd.readouterr()
+    with small_disk(disk) as leave:
+        for free in (0, 4096, 8192, len(whole.read_bytes()) // 2):
+            leave(free)
+            assert main(["render", str(shard), "--out", str(disk / name)]) == 1
+            said = capfd.readouterr().err
+            assert said.startswith(f"sluice-sim: {disk / name}: ") and said.endswith("No space left on device\n") and said.count("\n") == 1, said
+            assert os.listdir(disk) == ["filler"]
+        leave(None)
+        assert main(["render", str(shard), "--out", str(disk / name)]) == 0
+        assert (disk / name).read_bytes() == whole.read_bytes()
 
 
 def test_read_only_folder(tmp_path, reference):
