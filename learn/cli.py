@@ -12,7 +12,7 @@ import json
 import signal
 import sys
 
-from sim.errors import InputError, RunError
+from sim.errors import InputError, RunError, reason
 
 
 def _import(arguments: argparse.Namespace) -> None:
@@ -208,7 +208,7 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"sluice-learn: {error}", file=sys.stderr)
         return 2
     except (RunError, OSError) as error:
-        print(f"sluice-learn: {error}", file=sys.stderr)
+        print(f"sluice-learn: {reason(error) if isinstance(error, OSError) else error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         print("sluice-learn: interrupted", file=sys.stderr)

@@ -148,6 +148,7 @@ def _write(
         write_shard(out, predicted)
         write_json(out.with_name(out.name + ".cost.json"), content)
     except OSError as error:
+        out.unlink(missing_ok=True)  # without its cost it is not whole, and would stand in the way of the same command
         raise RunError(f"{out}: cannot be written: {error.strerror or error}") from None
     if len(failed) == len(predicted):
         raise RunError(f"{out}: all {len(failed)} rollouts failed: {next(iter(failed.values()))}")

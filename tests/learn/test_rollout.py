@@ -1,13 +1,18 @@
 from __future__ import annotations
 
-import errno
 import json
+import os
+import sys
 from pathlib import Path
 
 import dummy_model
 import numpy as np
 import pytest
 import torch
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from disks import small_disk
 
 from learn.checkpoint import load_model
 from learn.cli import main
@@ -66,14 +71,23 @@ def test_mistakes_of_a_rollout_from_a_scene(tmp_path: Path, dummy: Path, bounce_
     assert not (tmp_path / "out.h5").exists()
 
 
-def test_a_full_disk_is_named(dummy: Path, bounce_dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch) -> None:
-    def full(*_: object) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr("learn.rollout.write_shard", full)
-    out = tmp_path / "out.h5"
-    assert main(["rollout", str(dummy), "--data", str(bounce_dataset), "--out", str(out)]) == 1
-    assert capsys.readouterr().err == f"sluice-learn: {out}: cannot be written: No space left on device\n"
+def test_rollouts_on_a_full_disk(dummy: Path, bounce_dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """It fills up under the shard, then under what it cost: one line, nothing left, and with room the bytes of a rollout that had room."""
+    command = ["rollout", str(dummy), "--data", str(bounce_dataset), "--out"]
+    whole, disk = tmp_path / "whole.h5", tmp_path / "disk"
+    assert main([*command, str(whole)]) == 0
+    capsys.readouterr()
+    with small_disk(disk) as leave:
+        out = disk / "out.h5"
+        # The disk gives room in pages of 4096 bytes: the last one is just too few for the shard and its cost.
+        for free in (0, 4096, whole.stat().st_size // 2, -(-whole.stat().st_size // 4096) * 4096):
+            leave(free)
+            assert main([*command, str(out)]) == 1
+            assert capsys.readouterr().err == f"sluice-learn: {out}: cannot be written: No space left on device\n"
+            assert os.listdir(disk) == ["filler"]
+        leave(None)
+        assert main([*command, str(out)]) == 0
+        assert out.read_bytes() == whole.read_bytes() and (disk / "out.h5.cost.json").is_file()
 
 
 def test_a_rollout_goes_on_beyond_the_truth(dummy: Path, bounce_dataset: Path, tmp_path: Path) -> None:
