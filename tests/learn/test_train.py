@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import csv
-import errno
 import json
 import math
 import os
@@ -19,6 +18,10 @@ import torch
 import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from disks import small_disk
 
 from learn import train as training
 from learn.checkpoint import load_model, load_state, read_model_file, save_model
@@ -264,15 +267,25 @@ def test_a_loss_that_is_not_finite_stops_the_run(bounce_dataset: Path, tmp_path:
     assert load_model(tmp_path / "run" / "best.pt")
 
 
-def test_a_full_disk_stops_the_run_in_one_line(unbroken: Path, bounce_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(_: object) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    with monkeypatch.context() as disk, pytest.raises(RunError, match=r"run: cannot be written \(No space left on device\)"):
-        disk.setattr(os, "fsync", full)
-        train(config(), bounce_dataset, tmp_path / "run")
-    train(config(), bounce_dataset, tmp_path / "run")
-    assert_same_run(unbroken, tmp_path / "run")
+def test_a_full_disk_stops_the_run_in_one_line(unbroken: Path, bounce_dataset: Path, tmp_path: Path) -> None:
+    """It fills up under the tables, checkpoints, the best model: what is there is whole, and with room the run ends as one that had room."""
+    disk, stages, pages = tmp_path / "disk", [()], 0
+    run = disk / "run"
+    with small_disk(disk) as leave:
+        while not (run / "done.json").exists():
+            leave(4096 * pages)
+            try:
+                train(config(), bounce_dataset, run)
+            except RunError as error:
+                assert str(error) == f"{run}: cannot be written (No space left on device); mend that and give the same command again to resume"
+            present = tuple(sorted(path.name for path in run.glob("*.pt")))
+            assert not list(run.glob(".*")) and ("checkpoint.pt" not in present or load_state(run / "checkpoint.pt"))
+            assert "best.pt" not in present or load_model(run / "best.pt")
+            if present == stages[-1]:
+                pages += 1  # it came no further with what there was
+            stages.append(present)
+        assert {(), ("checkpoint.pt",), ("best.pt", "checkpoint.pt")} <= set(stages) and pages > 3
+        assert_same_run(unbroken, run)
 
 
 def test_a_budget_in_minutes(bounce_dataset: Path, tmp_path: Path) -> None:
