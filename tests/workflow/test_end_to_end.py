@@ -5,11 +5,17 @@ import os
 import re
 import shutil
 import signal
+import subprocess
+import sys
 import time
 from pathlib import Path
 
 import pytest
 from study_tree import begin_snakemake, planned, snakemake
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from disks import small_disk  # noqa: E402
 
 pytestmark = pytest.mark.workflow
 
@@ -144,6 +150,28 @@ def test_resume_after_kill_9(tree):
     assert (run / "log.csv").read_text().splitlines()[:4] == rows  # it went on, times and all, instead of beginning again
     assert json.loads((results / "models" / "gns" / "seed-0.json").read_text())["steps"] == 300
     assert {path: path.stat().st_mtime_ns for path in shards} == shards
+
+
+# A full disk ----------------------------------------------------------------------------------------------------------------
+
+
+def test_the_report_on_a_full_disk(finished, tmp_path):
+    """Under the summary, then under the page: one line in the job's log, nothing half written, and with room the same page."""
+    made, disk = finished / "results" / "micro", tmp_path / "disk"
+    command = [sys.executable, "-m", "workflow.scripts.summary", "configs/studies/micro.yaml", disk / "summary.json", disk / "report.html"]
+
+    def write():
+        done = subprocess.run(command, cwd=finished, capture_output=True, text=True)
+        return done.returncode, done.stderr
+
+    with small_disk(disk) as leave:
+        for free, name, left in ((4096, "summary.json", []), (64 * 4096, "report.html", ["summary.json"])):
+            leave(free)
+            assert write() == (1, f"sluice: {disk / name}: No space left on device\n")
+            assert sorted(os.listdir(disk)) == sorted(["filler", *left])
+        leave(None)
+        assert write() == (0, "")
+        assert (disk / "report.html").read_bytes() == (made / "report.html").read_bytes()
 
 
 # A shipped checkpoint -------------------------------------------------------------------------------------------------------

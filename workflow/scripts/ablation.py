@@ -1,10 +1,10 @@
 """Figure of a comparison's ablations. ``python -m workflow.scripts.ablation STUDY COMPARISON ROWS FIGURE``"""
 
 import json
-import sys
 from pathlib import Path
 
 from learn.figures import ablation
+from workflow.command import run
 from workflow.study import load_study
 
 
@@ -13,4 +13,4 @@ def main(study: str, comparison: str, rows: str, figure: str) -> None:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    run(main)

@@ -1,9 +1,8 @@
 """Rows of a comparison: every contender on every test trajectory. ``python -m workflow.scripts.errors STUDY COMPARISON OUT``"""
 
-import sys
-
 from learn.compare import compare
 from sim.trajectory import write_json
+from workflow.command import run
 from workflow.contenders import contenders, settings, test_trajectories
 from workflow.study import load_study
 
@@ -17,4 +16,4 @@ def main(path: str, comparison: str, out: str) -> None:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    run(main)

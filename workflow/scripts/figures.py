@@ -1,8 +1,7 @@
 """Figures of a comparison. ``python -m workflow.scripts.figures ROWS TIMING RUN_TIME TIME ENERGY``"""
 
-import sys
-
 from learn import figures
+from workflow.command import run
 from workflow.rows import timed_rows
 
 
@@ -14,4 +13,4 @@ def main(rows: str, timing: str, run_time: str, time: str, energy: str) -> None:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    run(main)

@@ -1,10 +1,10 @@
 """Film and still of a rollout beside its truth. ``python -m workflow.scripts.film TRUTH ROLLOUT TIMING FILM STILL``"""
 
 import json
-import sys
 from pathlib import Path
 
 from sim.render import render_comparison
+from workflow.command import run
 from workflow.names import REFERENCE
 from workflow.pictures import speed_note, whole
 
@@ -19,4 +19,4 @@ def main(truth_shard: str, rollout_shard: str, timing: str, film: str, still: st
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    run(main)

@@ -1,10 +1,10 @@
 """Figure of errors beyond the training. ``python -m workflow.scripts.generalisation STUDY COMPARISON FIGURE ROWS ...``"""
 
 import json
-import sys
 from pathlib import Path
 
 from learn.figures import generalisation
+from workflow.command import run
 from workflow.results import trained_on
 from workflow.study import load_study
 
@@ -16,4 +16,4 @@ def main(path: str, comparison: str, figure: str, *rows: str) -> None:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    run(main)

@@ -4,12 +4,12 @@ Filmed is the test trajectory on which the first film's contender has its median
 """
 
 import json
-import sys
 from pathlib import Path
 
 from learn.compare import median_trajectory
 from learn.rollout import rollout_trajectory
 from sim.trajectory import write_shard
+from workflow.command import run
 from workflow.contenders import learned, test_trajectories
 from workflow.study import load_study
 
@@ -29,4 +29,4 @@ def main(path: str, comparison: str, errors: str, truth: str, *shards: str) -> N
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    run(main)

@@ -1,11 +1,11 @@
 """``summary.json`` and ``report.html`` of a stability study. ``python -m workflow.scripts.stability_report STUDY SUMMARY REPORT CELLS ...``"""
 
 import json
-import sys
 from pathlib import Path
 
 from sim.stability.report import verdict, write_report
 from sim.trajectory import write_json
+from workflow.command import run
 from workflow.results import how_to_repeat
 from workflow.study import load_study
 
@@ -20,4 +20,4 @@ def main(path: str, out: str, report: str, *cells: str) -> None:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    run(main)

@@ -1,11 +1,11 @@
 """All cells of some cases of the stress matrix. ``python -m workflow.scripts.stress OUT CASE ...``"""
 
 import importlib
-import sys
 
 from learn.compare import hardware, versions
 from sim.stability.report import row
 from sim.trajectory import write_json
+from workflow.command import run
 
 
 def main(out: str, *cases: str) -> None:
@@ -18,4 +18,4 @@ def main(out: str, *cases: str) -> None:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    run(main)

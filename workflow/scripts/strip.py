@@ -1,8 +1,7 @@
 """Six moments of the truth, and below them the rollouts. ``python -m workflow.scripts.strip OUT TRUTH ROLLOUT ...``"""
 
-import sys
-
 from sim.render import render_strip
+from workflow.command import run
 from workflow.names import REFERENCE
 from workflow.pictures import whole
 
@@ -13,4 +12,4 @@ def main(out: str, truth: str, *rollouts: str) -> None:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    run(main)

@@ -1,9 +1,8 @@
 """``summary.json`` and ``report.html`` of a study. ``python -m workflow.scripts.summary STUDY SUMMARY REPORT``"""
 
-import sys
-
 from learn.report import write_report
 from sim.trajectory import write_json
+from workflow.command import run
 from workflow.results import assets, summarise
 from workflow.study import load_study
 
@@ -16,4 +15,4 @@ def main(path: str, out: str, report: str) -> None:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    run(main)

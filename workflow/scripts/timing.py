@@ -1,10 +1,10 @@
 """Interleaved run times of a comparison, and what they were measured on. ``python -m workflow.scripts.timing STUDY COMPARISON OUT``"""
 
 import dataclasses
-import sys
 
 from learn.compare import hardware, plain, time_comparison, versions
 from sim.trajectory import write_json
+from workflow.command import run
 from workflow.contenders import contenders, settings, test_trajectories
 from workflow.study import load_study
 
@@ -22,4 +22,4 @@ def main(path: str, comparison: str, out: str) -> None:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    run(main)

@@ -1,8 +1,7 @@
 """Loss and validation error of trainings. ``python -m workflow.scripts.training_curve OUT LABEL=RUN ...``"""
 
-import sys
-
 from learn.figures import training_curve
+from workflow.command import run
 
 
 def main(out: str, *runs: str) -> None:
@@ -10,4 +9,4 @@ def main(out: str, *runs: str) -> None:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    run(main)
