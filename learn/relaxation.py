@@ -44,7 +44,10 @@ def relax(
     """Positions [particles, dim] float64 after ``settings.loops`` steps; bounds [dim, 2] and spacing in the same length.
 
     fixed [particles] bool: kinematic particles, which repel and do not move; period [dim] of a periodic box, whose positions may be any images.
+    Positions of which one is not finite come back as they are: the rollout that they are of ends with them.
     """
+    if not np.isfinite(position).all():
+        return position
     outside = position - periodic.wrapped(position, bounds, period)
     position = position - outside
     count, dim = position.shape

@@ -20,6 +20,13 @@ def lattice(n: int, dim: int = 2, spacing: float = SPACING) -> np.ndarray:
     return np.stack(np.meshgrid(*[np.arange(n) * spacing] * dim, indexing="ij"), -1).reshape(-1, dim)
 
 
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_what_is_not_finite_is_for_the_rollout_to_name(bad):
+    position = lattice(3)
+    position[4, 1] = bad
+    np.testing.assert_array_equal(relax(position, BOX, SPACING, Relaxation()), position)
+
+
 def test_a_pair_by_hand():
     """Two particles r apart: rho = w (1 + c^2), c = 1 - r / h; each moves strength spacing 2 p c along the line between them."""
     r = 0.02
