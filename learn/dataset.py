@@ -250,6 +250,8 @@ class Dataset:
                 values = {"dim": dim, "radius": float(meta["radius"]), "frame_step": float(meta["frame_step"]), "bounds": _tuple(meta["bounds"]),
                           "spacing": float(scene["spacing"]), "gravity": tuple(float(g) for g in scene["gravity"]),
                           "periodic": periodic.axes(scene)}
+                if len(values["gravity"]) != dim:
+                    raise ValueError(f"gravity has {len(values['gravity'])} entries")
             except (KeyError, TypeError, ValueError) as error:
                 remedy = "must have spacing and gravity [dim]; generate the shard again"
                 raise InputError(reader.path, f"{index:06d}/scene", str(error), remedy) from None
