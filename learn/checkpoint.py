@@ -31,7 +31,7 @@ FORMAT_VERSION = 1
 #: What stands beside the tensors of a file.
 PLAIN_KEYS = ("settings", "spec", "provenance", "config", "sampler", "progress")
 #: Larger models are slips of the keyboard: they would exhaust memory or time before anything could say so.
-MOST_PARAMETERS, MOST_TENSORS, MOST_ENTRIES = 10**9, 20_000, 10**6
+MOST_PARAMETERS, MOST_TENSORS, MOST_ENTRIES = 10**8, 20_000, 10**6
 MODEL_FORMAT, STATE_FORMAT = "sluice-model", "sluice-training-state"
 
 Checked = TypeVar("Checked", bound=BaseModel)

@@ -91,7 +91,7 @@ def spoil_text(text, rng, mark):
         "python": lambda: "\n".join([*lines[:at], f"{key}: !!python/object/apply:os.mkdir ['{mark}']", *lines[at + 1 :]]),
         "tag": lambda: "\n".join([*lines[:at], f"{key}: {rng.choice(['!!set {a}', '!!binary aGk=', '!!omap [a: 1]', '!x y', '!!float x', '!!int '])}",
                                   *lines[at + 1 :]]),
-        "deep": lambda: "\n".join([*lines[:at], f"{key}: " + "[" * 5000, *lines[at + 1 :]]),
+        "deep": lambda: "\n".join([*lines[:at], f"{key}: " + "[" * 1000, *lines[at + 1 :]]),
         "nested": lambda: "\n".join([*lines[:at], f"{key}: " + "[" * 200 + "]" * 200, *lines[at + 1 :]]),
         "digits": lambda: "\n".join([*lines[:at], f"{key}: " + "9" * 5000, *lines[at + 1 :]]),
         "octal": lambda: "\n".join([*lines[:at], f"{key}: {rng.choice(['0x', '1:30:00', '0o17', '2020-13-45', '.nan', '-.inf', '~', '=', '<<'])}",
