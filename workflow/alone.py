@@ -14,14 +14,16 @@ from sim.errors import InputError
 
 
 def hold(folder: Path) -> None:
-    """Hold the results of a study until this process ends; ``InputError`` while another run holds them."""
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    lock = os.open(folder.parent / f".{folder.name}.lock", os.O_CREAT | os.O_RDWR)
+    """Hold the results of a study until this process ends; ``InputError`` while another run holds them, and where nothing can be written."""
     try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        lock = os.open(folder.parent / f".{folder.name}.lock", os.O_CREAT | os.O_RDWR)
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        os.ftruncate(lock, 0)
+        os.write(lock, str(os.getpid()).encode())
     except BlockingIOError:
         process = os.read(lock, 20).decode()
         remedy = f"another run is at work on it (process {process}); wait for its end, or stop it: kill -INT {process}"
         raise InputError(folder, "study", folder.name, remedy) from None
-    os.ftruncate(lock, 0)
-    os.write(lock, str(os.getpid()).encode())
+    except OSError as error:
+        raise InputError(folder, "study", folder.name, f"{folder.parent} cannot be written ({error.strerror}); mend that and start again") from None

@@ -9,6 +9,9 @@ import time
 import pytest
 from study_tree import ROOT, begin_snakemake, planned, snakemake
 
+from sim.errors import InputError
+from workflow.alone import hold
+
 HOLD = """
 import sys, time
 from pathlib import Path
@@ -43,6 +46,12 @@ def test_a_study_is_held_by_one_process_until_it_ends(tmp_path):
         for process in (first, other):
             process.kill()
             process.communicate()
+
+
+def test_where_nothing_can_be_written(tmp_path):
+    (tmp_path / "results").touch()
+    with pytest.raises(InputError, match=r"results cannot be written \(File exists\); mend that"):
+        hold(tmp_path / "results/a")
 
 
 @pytest.mark.workflow
