@@ -252,9 +252,12 @@ EDITS = [
     # A solver's source: its data, all that is trained on them, all that is compared with it.
     ("sim/mpm/walls.py", None, {"data learning", "data test", *LEARNED, *COMPARED}),
     ("sim/mpm/solver.py", None, {"data learning", "data test", *LEARNED, *COMPARED}),
+    ("sim/sph/wcsph.py", None, set()),  # the puddle is material points'
+    ("sim/pbd/solver.py", None, set()),
     ("learn/gns.py", None, {"train gns", *COMPARED}),
     ("learn/grid_emulator.py", None, {"train grid", *COMPARED}),
     ("learn/train.py", None, LEARNED),
+    ("learn/metrics.py", None, {*LEARNED, *COMPARED, "report"}),  # trainings choose their best weights by it
     ("learn/compare.py", None, COMPARED | {"report"}),
     ("learn/report_template.html", None, {"report"}),
     ("learn/generalisation.py", None, {"report"}),
