@@ -92,6 +92,10 @@ class Study:
         """Cases of the stress matrix by job; empty in a study that compares."""
         return self.content["stability"]
 
+    def resource(self, section: str, name: str, key: str, default: int) -> int:
+        """What an entry of ``data`` or ``models`` asks the scheduler for."""
+        return self.content[section][name].get("resources", {}).get(key, default)
+
     # -- places
 
     def data_folder(self, data: str, part: str) -> Path:
@@ -182,7 +186,8 @@ class Study:
 
     def report_recipe(self) -> str:
         """Hash of what the report says beyond its input files: title, targets, settings, and its code and template."""
-        return digest(self.content, code_hash("workflow.scripts.summary"), (ROOT / "learn" / "report_template.html").read_text())
+        sections = {section: {name: entry | {"resources": None} for name, entry in self.content[section].items()} for section in ("data", "models")}
+        return digest(self.content | sections, code_hash("workflow.scripts.summary"), (ROOT / "learn" / "report_template.html").read_text())
 
     def stress_recipe(self, job: str) -> str:
         """Hash of the code that the cases of a job run."""

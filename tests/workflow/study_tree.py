@@ -36,7 +36,7 @@ variants:
 MICRO_GNS = """
 model: gns
 settings: {latent: 8, message_passing: 1, history: 2, edge_cap: 100.0, ballistic: true}
-training: {steps: 300, batch: 1, validations: 1, validation_trajectories: 1, validation_frames: 4, log_every: 5, checkpoint_every: 20}
+training: {steps: 300, batch: 2, validations: 1, validation_trajectories: 1, validation_frames: 4, log_every: 5, checkpoint_every: 20}
 """
 
 MICRO_GRID = """

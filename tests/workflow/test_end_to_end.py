@@ -5,6 +5,7 @@ import os
 import re
 import shutil
 import signal
+import subprocess
 import time
 from pathlib import Path
 
@@ -128,6 +129,36 @@ def test_an_edit_makes_again_what_it_must(copied, name):
     assert set(jobs) == expected
     if name in ("network", "grid emulator", "model"):
         assert jobs["train"] == 1  # the other model is as it was
+
+
+# Devices --------------------------------------------------------------------------------------------------------------------
+
+
+def test_a_study_chooses_device_and_processes(copied):
+    study = copied / "configs" / "studies" / "micro.yaml"
+    plain = "gns: {config: configs/models/micro_gns.yaml, data: puddle, seeds: [0]}"
+    replace(study, plain, plain[:-1] + ", resources: {gpus: 2, threads: 2, mem_mb: 3000, runtime: 5}}")
+    replace(study, "train: 2, valid: 1", "resources: {threads: 2}, train: 2, valid: 1")
+    assert planned(copied) == {}  # what runs where is no part of the result
+
+    def command(*options):
+        target = "results/micro/models/gns/seed-0.pt"
+        code, output = snakemake(copied, target, "--dry-run", "--printshellcmds", "--force", *options)
+        assert code == 0, output
+        return re.search(r"Shell command: (.* -m learn train .*)", output)[1]
+
+    one = command()  # of a machine that is not said to have more
+    assert "--threads 2 --device cuda" in one and "torch.distributed" not in one
+    several = command("--resources", "gpu=4", "--cores", "4")
+    assert "-m torch.distributed.run --standalone --nproc-per-node 2 -m learn train" in several and "--threads 2 --device cuda" in several
+    replace(study, "gpus: 2, threads: 2", "gpus: 0")
+    none = command()
+    assert "--threads 1 --device cpu" in none and "torch.distributed" not in none
+    # The command of two GPUs, on two CPU processes.
+    shutil.rmtree(copied / "results" / "micro" / "training" / "gns")
+    made = subprocess.run(several.replace("--threads 2 --device cuda", "--device cpu"), shell=True, cwd=copied, executable="/bin/bash")
+    done = json.loads((copied / "results" / "micro" / "models" / "gns" / "seed-0.json").read_text())
+    assert made.returncode == 0 and (done["processes"], done["device"], done["steps"]) == (2, "cpu", 300)
 
 
 # Resuming -------------------------------------------------------------------------------------------------------------------
