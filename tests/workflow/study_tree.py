@@ -83,19 +83,23 @@ def make_tree(folder: Path) -> Path:
     return folder
 
 
-def begin_snakemake(folder: Path, *options: str, study: str = "configs/studies/micro.yaml") -> subprocess.Popen:
-    """Snakemake in a tree, in a process group of its own."""
+def begin_snakemake(
+    folder: Path, *options: str, study: str = "configs/studies/micro.yaml", program: tuple = ("-m", "snakemake"), environment: dict | None = None,
+    stdout=subprocess.PIPE,
+) -> subprocess.Popen:
+    """Snakemake in a tree, in a process group of its own; on two cores, unless a profile is named."""
     # Compiled kernels are shared with the checkout: what is tested is the workflow, not the compiler.
-    environment = os.environ | {"SLUICE_TAICHI_CACHE": str(ROOT / ".taichi_cache")}
-    command = [sys.executable, "-m", "snakemake", "--cores", "2", *options, "--config", f"study={study}"]
+    environment = os.environ | {"SLUICE_TAICHI_CACHE": str(ROOT / ".taichi_cache")} | (environment or {})
+    cores = () if "--workflow-profile" in options else ("--cores", "2")
+    command = [sys.executable, *program, *cores, *options, "--config", f"study={study}"]
     return subprocess.Popen(
-        command, cwd=folder, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True
+        command, cwd=folder, env=environment, text=True, stdout=stdout, stderr=subprocess.STDOUT, start_new_session=True
     )
 
 
-def snakemake(folder: Path, *options: str, study: str = "configs/studies/micro.yaml") -> tuple[int, str]:
+def snakemake(folder: Path, *options: str, **settings) -> tuple[int, str]:
     """(exit code, output)."""
-    process = begin_snakemake(folder, *options, study=study)
+    process = begin_snakemake(folder, *options, **settings)
     output, _ = process.communicate(timeout=900)
     return process.returncode, output
 
