@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import csv
+import hashlib
+import json
 import os
 import shutil
 import subprocess
@@ -113,3 +116,26 @@ def planned(folder: Path, *options: str, study: str = "configs/studies/micro.yam
     table = output.split("Job stats:")[1].strip().splitlines()[2:]
     rows = [line.split() for line in table[: next(i for i, line in enumerate(table) if line.startswith("total"))]]
     return {rule: int(count) for rule, count in rows if rule != "all"}
+
+
+def promised(results: Path) -> dict[str, object]:
+    """What any two runs of a study have in common to the bit, however often they were killed and wherever they ran: name -> content.
+
+    Trajectory files whole; of models the weights, of tables and rows what is not a time.
+    """
+    import torch
+
+    kept = {}
+    for path in sorted(results.rglob("*")):
+        name = str(path.relative_to(results))
+        if path.suffix == ".h5":
+            kept[name] = hashlib.sha256(path.read_bytes()).hexdigest()
+        elif path.suffix == ".pt" and path.name != "checkpoint.pt":
+            weights = torch.load(path, weights_only=True)["state_dict"]
+            kept[name] = {key: hashlib.sha256(weight.numpy().tobytes()).hexdigest() for key, weight in weights.items()}
+        elif path.suffix == ".csv":
+            kept[name] = [{key: value for key, value in row.items() if key != "seconds"} for row in csv.DictReader(path.read_text().splitlines())]
+        elif path.name == "errors.json":
+            keys = ("contender", "one_step_mse", "rollout_mse", "kinetic_energy_mse", "trajectories")
+            kept[name] = [{key: row[key] for key in keys} for row in json.loads(path.read_text())]
+    return kept
