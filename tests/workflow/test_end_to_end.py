@@ -1,7 +1,9 @@
 """One study from nothing to its report; what an edit makes again; resuming after kill -9."""
 
+import contextlib
 import json
 import os
+import random
 import re
 import shutil
 import signal
@@ -10,7 +12,7 @@ import time
 from pathlib import Path
 
 import pytest
-from study_tree import begin_snakemake, planned, snakemake
+from study_tree import begin_snakemake, make_tree, planned, promised, snakemake
 
 pytestmark = pytest.mark.workflow
 
@@ -194,6 +196,51 @@ def test_resume_after_kill_9(tree):
     assert (run / "log.csv").read_text().splitlines()[:4] == rows  # it went on, times and all, instead of beginning again
     assert json.loads((results / "models" / "gns" / "seed-0.json").read_text())["steps"] == 300
     assert {path: path.stat().st_mtime_ns for path in shards} == shards
+
+
+def end(process: subprocess.Popen) -> None:
+    """End by SIGKILL all that is left of a run, and see it gone."""
+    deadline = time.monotonic() + 10
+    with contextlib.suppress(ProcessLookupError):
+        while time.monotonic() < deadline:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.poll()
+            time.sleep(0.01)
+
+
+def test_killed_at_random_instants_it_ends_with_the_same_results(finished, tmp_path, request):
+    """By turns all processes at once, as by a power cut, and Snakemake alone, whose jobs go on beside the next run; as ``make resume`` goes on."""
+    kills, draw = request.config.getoption("--kills"), random.Random(0)
+    # Twice the time that each has on average: some instants are early, some late, and what ends before its instant is begun anew.
+    longest = 2 * float((finished / "seconds").read_text()) / kills
+    unbroken = promised(finished / "results" / "micro")
+    at, runs, begun, tree = [], 0, [], None
+    try:
+        while tree or len(at) < kills:
+            if tree:
+                assert snakemake(tree, "--unlock")[0] == 0
+            else:
+                tree, runs = make_tree(tmp_path / f"tree-{runs}"), runs + 1
+            with open(tmp_path / "output", "w") as output:
+                begun.append(begin_snakemake(tree, stdout=output))
+            try:
+                code = begun[-1].wait(draw.uniform(0, longest) if len(at) < kills else 600)
+            except subprocess.TimeoutExpired:
+                at.append(len(list((tree / "results").rglob("*.tsv"))))
+                if len(at) % 2:
+                    end(begun[-1])
+                else:
+                    begun[-1].kill()
+                    begun[-1].wait()
+                continue
+            assert code == 0, (tmp_path / "output").read_text()
+            assert promised(tree / "results" / "micro") == unbroken
+            tree = None
+    finally:
+        for process in begun:
+            end(process)
+    assert len(at) == kills
+    print(f"\nkilled when {', '.join(map(str, at))} of 12 jobs were done, in {runs} runs")
 
 
 # A shipped checkpoint -------------------------------------------------------------------------------------------------------
