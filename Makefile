@@ -4,9 +4,10 @@ PYTHON ?= python3.11
 VENV := .venv
 PY := $(VENV)/bin/python
 STUDY ?= demo
+PROFILE ?= default
 # Named by what it was installed from, so that changed pins mean a new installation and a removed folder does as well.
 INSTALLED := $(VENV)/.installed-$(shell cat constraints.txt pyproject.toml | sha256sum | cut -c1-16)
-SNAKEMAKE = $(PY) -m snakemake --config study=configs/studies/$(STUDY).yaml
+SNAKEMAKE = $(PY) -m snakemake --workflow-profile profiles/$(PROFILE) --config study=configs/studies/$(STUDY).yaml
 
 .PHONY: demo smoke study resume test validate gallery bench setup system
 .DEFAULT_GOAL := demo
@@ -17,7 +18,7 @@ demo: ## the demonstration: results/demo/report.html, in about twenty minutes on
 smoke: ## every part once, in about three minutes: results/smoke/report.html
 	@$(MAKE) --no-print-directory study STUDY=smoke
 
-study: setup ## any study: make study STUDY=paper
+study: setup ## any study, on any machine: make study STUDY=paper PROFILE=slurm (docs/clusters.md)
 	@$(SNAKEMAKE)
 	@echo "Done: results/$(STUDY)/report.html"
 

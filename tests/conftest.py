@@ -3,6 +3,10 @@ import pytest
 from sim.mpm.solver import MPMSimulator
 
 
+def pytest_addoption(parser):
+    parser.addoption("--kills", type=int, default=2, help="random instants at which the micro study is killed (tests/workflow/test_end_to_end.py)")
+
+
 @pytest.fixture(scope="module")
 def water():
     """One solver for all 2D scenes of water in a file: they share its kernels."""

@@ -13,6 +13,8 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ("sim", "learn", "workflow")
+#: Where ``sim.solvers`` finds the solver of each method.
+SOLVERS = {"mpm": "sim.mpm.solver", "wcsph": "sim.sph.solver", "dfsph": "sim.sph.solver", "pbf": "sim.pbd.solver"}
 
 
 def _file(module: str) -> Path | None:
@@ -41,22 +43,26 @@ def _parsed(module: str) -> tuple[str, frozenset[str]]:
     return hashlib.sha256(code).hexdigest(), frozenset(names)
 
 
-def closure(*modules: str) -> list[str]:
-    """The modules of ours that ``modules`` need, themselves and the packages around them included, sorted."""
+def closure(*modules: str, method: str | None = None) -> list[str]:
+    """The modules of ours that ``modules`` need, themselves and the packages around them included, sorted.
+
+    Where one ``method`` of solving is all that is run, the solvers of others count for nothing, and what only they need.
+    """
+    others = set() if method is None else set(SOLVERS.values()) - {SOLVERS[method]}
     found: set[str] = set()
     waiting = list(modules)
     while waiting:
         module = waiting.pop()
-        if module in found or module.split(".")[0] not in PACKAGES or _file(module) is None:
+        if module in found or module in others or module.split(".")[0] not in PACKAGES or _file(module) is None:
             continue
         found.add(module)
         waiting += [*_parsed(module)[1], *(module.rsplit(".", depth)[0] for depth in range(1, module.count(".") + 1))]
     return sorted(found)
 
 
-def code_hash(*modules: str) -> str:
-    """One hash over everything that ``modules`` need."""
-    lines = [f"{module} {_parsed(module)[0]}" for module in closure(*modules)]
+def code_hash(*modules: str, method: str | None = None) -> str:
+    """One hash over everything that ``modules`` need; see ``closure``."""
+    lines = [f"{module} {_parsed(module)[0]}" for module in closure(*modules, method=method)]
     return hashlib.sha256("\n".join(lines).encode()).hexdigest()[:16]
 
 

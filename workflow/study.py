@@ -92,6 +92,10 @@ class Study:
         """Cases of the stress matrix by job; empty in a study that compares."""
         return self.content["stability"]
 
+    def resource(self, section: str, name: str, key: str, default: int) -> int:
+        """What an entry of ``data`` or ``models`` asks the scheduler for."""
+        return self.content[section][name].get("resources", {}).get(key, default)
+
     # -- places
 
     def data_folder(self, data: str, part: str) -> Path:
@@ -155,11 +159,15 @@ class Study:
 
     # -- what results depend on, besides their input files
 
+    def method(self, data: str) -> str:
+        """How the solver of a data set works: ``mpm``, ``dfsph``, ..."""
+        return self.families[data].model.solver.method
+
     def data_recipe(self, data: str, part: str) -> str:
         """Hash of all that determines a part of a data set: the scene family as read, counts, seed, the generator's code."""
         family = {key: value for key, value in self.families[data].to_dict().items() if key not in ("splits", "variants")}
         counts = {split: self.data[data][split] for split in PARTS[part]}
-        return digest(family, counts, self.data[data]["seed"], code_hash("sim.generate"))
+        return digest(family, counts, self.data[data]["seed"], code_hash("sim.generate", method=self.method(data)))
 
     def train_recipe(self, model: str, seed: int | str) -> str:
         """Hash of all that determines a training: configuration, budget, seed, data, the trainer's and the model's code."""
@@ -174,11 +182,12 @@ class Study:
         modules = {known[self.configs[model]["model"]] for model in entry["learned"] if model in self.configs}
         if any("checkpoint" in self.models[model] for model in entry["learned"]):
             modules = set(known.values())
-        return digest({key: entry[key] for key in keys}, code_hash(f"workflow.scripts.{script}", *modules))
+        return digest({key: entry[key] for key in keys}, code_hash(f"workflow.scripts.{script}", *modules, method=self.method(entry["data"])))
 
     def report_recipe(self) -> str:
         """Hash of what the report says beyond its input files: title, targets, settings, and its code and template."""
-        return digest(self.content, code_hash("workflow.scripts.summary"), (ROOT / "learn" / "report_template.html").read_text())
+        sections = {section: {name: entry | {"resources": None} for name, entry in self.content[section].items()} for section in ("data", "models")}
+        return digest(self.content | sections, code_hash("workflow.scripts.summary"), (ROOT / "learn" / "report_template.html").read_text())
 
     def stress_recipe(self, job: str) -> str:
         """Hash of the code that the cases of a job run."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -22,8 +23,10 @@ def tree(tmp_path: Path) -> Path:
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A tree in which the micro study has been made; not to be changed by a test."""
     folder = make_tree(tmp_path_factory.mktemp("micro") / "tree")
+    begun = time.monotonic()
     code, output = snakemake(folder)
     assert code == 0, output
+    (folder / "seconds").write_text(str(time.monotonic() - begun))
     return folder
 
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import csv
+import hashlib
+import json
 import os
 import shutil
 import subprocess
@@ -36,7 +39,7 @@ variants:
 MICRO_GNS = """
 model: gns
 settings: {latent: 8, message_passing: 1, history: 2, edge_cap: 100.0, ballistic: true}
-training: {steps: 300, batch: 1, validations: 1, validation_trajectories: 1, validation_frames: 4, log_every: 5, checkpoint_every: 20}
+training: {steps: 300, batch: 2, validations: 1, validation_trajectories: 1, validation_frames: 4, log_every: 5, checkpoint_every: 20}
 """
 
 MICRO_GRID = """
@@ -83,19 +86,23 @@ def make_tree(folder: Path) -> Path:
     return folder
 
 
-def begin_snakemake(folder: Path, *options: str, study: str = "configs/studies/micro.yaml") -> subprocess.Popen:
-    """Snakemake in a tree, in a process group of its own."""
+def begin_snakemake(
+    folder: Path, *options: str, study: str = "configs/studies/micro.yaml", program: tuple = ("-m", "snakemake"), environment: dict | None = None,
+    stdout=subprocess.PIPE,
+) -> subprocess.Popen:
+    """Snakemake in a tree, in a process group of its own; on two cores, unless a profile is named."""
     # Compiled kernels are shared with the checkout: what is tested is the workflow, not the compiler.
-    environment = os.environ | {"SLUICE_TAICHI_CACHE": str(ROOT / ".taichi_cache")}
-    command = [sys.executable, "-m", "snakemake", "--cores", "2", *options, "--config", f"study={study}"]
+    environment = os.environ | {"SLUICE_TAICHI_CACHE": str(ROOT / ".taichi_cache")} | (environment or {})
+    cores = () if "--workflow-profile" in options else ("--cores", "2")
+    command = [sys.executable, *program, *cores, *options, "--config", f"study={study}"]
     return subprocess.Popen(
-        command, cwd=folder, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True
+        command, cwd=folder, env=environment, text=True, stdout=stdout, stderr=subprocess.STDOUT, start_new_session=True
     )
 
 
-def snakemake(folder: Path, *options: str, study: str = "configs/studies/micro.yaml") -> tuple[int, str]:
+def snakemake(folder: Path, *options: str, **settings) -> tuple[int, str]:
     """(exit code, output)."""
-    process = begin_snakemake(folder, *options, study=study)
+    process = begin_snakemake(folder, *options, **settings)
     output, _ = process.communicate(timeout=900)
     return process.returncode, output
 
@@ -109,3 +116,26 @@ def planned(folder: Path, *options: str, study: str = "configs/studies/micro.yam
     table = output.split("Job stats:")[1].strip().splitlines()[2:]
     rows = [line.split() for line in table[: next(i for i, line in enumerate(table) if line.startswith("total"))]]
     return {rule: int(count) for rule, count in rows if rule != "all"}
+
+
+def promised(results: Path) -> dict[str, object]:
+    """What any two runs of a study have in common to the bit, however often they were killed and wherever they ran: name -> content.
+
+    Trajectory files whole; of models the weights, of tables and rows what is not a time.
+    """
+    import torch
+
+    kept = {}
+    for path in sorted(results.rglob("*")):
+        name = str(path.relative_to(results))
+        if path.suffix == ".h5":
+            kept[name] = hashlib.sha256(path.read_bytes()).hexdigest()
+        elif path.suffix == ".pt" and path.name != "checkpoint.pt":
+            weights = torch.load(path, weights_only=True)["state_dict"]
+            kept[name] = {key: hashlib.sha256(weight.numpy().tobytes()).hexdigest() for key, weight in weights.items()}
+        elif path.suffix == ".csv":
+            kept[name] = [{key: value for key, value in row.items() if key != "seconds"} for row in csv.DictReader(path.read_text().splitlines())]
+        elif path.name == "errors.json":
+            keys = ("contender", "one_step_mse", "rollout_mse", "kinetic_energy_mse", "trajectories")
+            kept[name] = [{key: row[key] for key in keys} for row in json.loads(path.read_text())]
+    return kept

@@ -1,7 +1,9 @@
 """One study from nothing to its report; what an edit makes again; resuming after kill -9."""
 
+import contextlib
 import json
 import os
+import random
 import re
 import shutil
 import signal
@@ -11,7 +13,7 @@ import time
 from pathlib import Path
 
 import pytest
-from study_tree import begin_snakemake, planned, snakemake
+from study_tree import begin_snakemake, make_tree, planned, promised, snakemake
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
@@ -98,8 +100,24 @@ EDITS = {
         lambda tree: append(tree / "sim" / "mpm" / "solver.py"),
         {"learning_data", "test_data", "train", "errors", "timing", "rollouts", "report", *PICTURES},
     ),
+    "other solvers": (lambda tree: [append(tree / "sim" / name) for name in ("sph/wcsph.py", "sph/dfsph.py", "pbd/solver.py")], set()),
     "comment": (lambda tree: append(tree / "sim" / "mpm" / "solver.py", "\n# a comment\n"), set()),
     "network": (lambda tree: append(tree / "learn" / "gns.py"), {"train", "errors", "timing", "rollouts", "report", *PICTURES}),
+    "grid emulator": (
+        lambda tree: append(tree / "learn" / "grid_emulator.py"),
+        {"train", "errors", "timing", "rollouts", "report", *PICTURES},
+    ),
+    "metrics": (lambda tree: append(tree / "learn" / "metrics.py"), {"train", "errors", "timing", "rollouts", "report", *PICTURES}),
+    "scene": (
+        lambda tree: replace(tree / "configs" / "scenes" / "puddle.yaml", "sound_speed: 6.0", "sound_speed: 7.0"),
+        {"learning_data", "test_data", "train", "errors", "timing", "rollouts", "report", *PICTURES},
+    ),
+    "model": (
+        lambda tree: replace(tree / "configs" / "models" / "micro_gns.yaml", "latent: 8", "latent: 9"),
+        {"train", "errors", "timing", "rollouts", "report", *PICTURES},
+    ),
+    "rendering": (lambda tree: append(tree / "sim" / "render.py"), {"film", "strip", "report"}),
+    "template": (lambda tree: append(tree / "learn" / "report_template.html", "<!-- edited -->"), {"report"}),
     "figures": (lambda tree: append(tree / "learn" / "figures.py"), {"figures", "training_curve", "report"}),
     "report": (lambda tree: append(tree / "learn" / "report.py"), {"report"}),
     "target": (lambda tree: replace(tree / "configs" / "studies" / "micro.yaml", "1.0e-12", "1.0"), {"report"}),
@@ -116,8 +134,38 @@ def test_an_edit_makes_again_what_it_must(copied, name):
     change(copied)
     jobs = planned(copied)
     assert set(jobs) == expected
-    if name == "network":
+    if name in ("network", "grid emulator", "model"):
         assert jobs["train"] == 1  # the other model is as it was
+
+
+# Devices --------------------------------------------------------------------------------------------------------------------
+
+
+def test_a_study_chooses_device_and_processes(copied):
+    study = copied / "configs" / "studies" / "micro.yaml"
+    plain = "gns: {config: configs/models/micro_gns.yaml, data: puddle, seeds: [0]}"
+    replace(study, plain, plain[:-1] + ", resources: {gpus: 2, threads: 2, mem_mb: 3000, runtime: 5}}")
+    replace(study, "train: 2, valid: 1", "resources: {threads: 2}, train: 2, valid: 1")
+    assert planned(copied) == {}  # what runs where is no part of the result
+
+    def command(*options):
+        target = "results/micro/models/gns/seed-0.pt"
+        code, output = snakemake(copied, target, "--dry-run", "--printshellcmds", "--force", *options)
+        assert code == 0, output
+        return re.search(r"Shell command: (.* -m learn train .*)", output)[1]
+
+    one = command()  # of a machine that is not said to have more
+    assert "--threads 2 --device cuda" in one and "torch.distributed" not in one
+    several = command("--resources", "gpu=4", "--cores", "4")
+    assert "-m torch.distributed.run --standalone --nproc-per-node 2 -m learn train" in several and "--threads 2 --device cuda" in several
+    replace(study, "gpus: 2, threads: 2", "gpus: 0")
+    none = command()
+    assert "--threads 1 --device cpu" in none and "torch.distributed" not in none
+    # The command of two GPUs, on two CPU processes.
+    shutil.rmtree(copied / "results" / "micro" / "training" / "gns")
+    made = subprocess.run(several.replace("--threads 2 --device cuda", "--device cpu"), shell=True, cwd=copied, executable="/bin/bash")
+    done = json.loads((copied / "results" / "micro" / "models" / "gns" / "seed-0.json").read_text())
+    assert made.returncode == 0 and (done["processes"], done["device"], done["steps"]) == (2, "cpu", 300)
 
 
 # Resuming -------------------------------------------------------------------------------------------------------------------
@@ -150,6 +198,49 @@ def test_resume_after_kill_9(tree):
     assert (run / "log.csv").read_text().splitlines()[:4] == rows  # it went on, times and all, instead of beginning again
     assert json.loads((results / "models" / "gns" / "seed-0.json").read_text())["steps"] == 300
     assert {path: path.stat().st_mtime_ns for path in shards} == shards
+
+
+def end(process: subprocess.Popen) -> None:
+    """End by SIGKILL all that is left of a run, and see it gone."""
+    deadline = time.monotonic() + 10
+    with contextlib.suppress(ProcessLookupError):
+        while time.monotonic() < deadline:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.poll()
+            time.sleep(0.01)
+
+
+def test_killed_at_random_instants_it_ends_with_the_same_results(finished, tmp_path, request):
+    """By turns all processes at once, as by a power cut, and Snakemake alone, whose jobs go on beside the next run; as ``make resume`` goes on."""
+    kills, draw = request.config.getoption("--kills"), random.Random(0)
+    # Twice the time that each has on average: some instants are early, some late, and what ends before its instant is begun anew.
+    longest = 2 * float((finished / "seconds").read_text()) / kills
+    unbroken = promised(finished / "results" / "micro")
+    at, runs, begun, tree = [], 0, [], None
+    try:
+        while tree or len(at) < kills:
+            if not tree:
+                tree, runs = make_tree(tmp_path / f"tree-{runs}"), runs + 1
+            with open(tmp_path / "output", "w") as output:
+                begun.append(begin_snakemake(tree, stdout=output))
+            try:
+                code = begun[-1].wait(draw.uniform(0, longest) if len(at) < kills else 600)
+            except subprocess.TimeoutExpired:
+                at.append(len(list((tree / "results").rglob("*.tsv"))))
+                if len(at) % 2:
+                    end(begun[-1])
+                else:
+                    begun[-1].kill()
+                    begun[-1].wait()
+                continue
+            assert code == 0, (tmp_path / "output").read_text()
+            assert promised(tree / "results" / "micro") == unbroken
+            tree = None
+    finally:
+        for process in begun:
+            end(process)
+    assert len(at) == kills
+    print(f"\nkilled when {', '.join(map(str, at))} of 12 jobs were done, in {runs} runs")
 
 
 # A full disk ----------------------------------------------------------------------------------------------------------------

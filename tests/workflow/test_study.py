@@ -108,6 +108,10 @@ MISTAKES = [
     (put(*COMPARISON, "generalisation", value={"over": "scene"}), "comparisons.puddle.generalisation.with = None: one scene has nothing"),
     (put(*COMPARISON, "generalisation", value={"over": "particles", "with": ["puddle"]}), "with = 'puddle': not among the other comparisons: none"),
     (lambda content: larger(content, ["gns"]), "generalisation.with = 'larger': must compare the same models, learned: [gns, grid]"),
+    (put("models", "gns", "resources", value={"gpu": 1}), "models.gns.resources.gpu = 1: unknown key; the keys here are gpus"),
+    (put("models", "gns", "resources", value={"gpus": -1}), "models.gns.resources.gpus = -1"),
+    (put("data", "puddle", "resources", value={"gpus": 1}), "data.puddle.resources.gpus = 1: unknown key; the keys"),
+    (put("data", "puddle", "resources", value={"threads": 0}), "data.puddle.resources.threads = 0"),
     (put("models", "gns", "variant", value="big"), "variant = 'big': not among the variants (there are none)"),
     (put("stability", value={"a": ["rest"]}), "a study of stability has title and stability alone"),
     (lambda content: content["comparisons"].update(again=content["comparisons"]["puddle"]), "two comparisons share this one"),
@@ -293,9 +297,12 @@ EDITS = [
     # A solver's source: its data, all that is trained on them, all that is compared with it.
     ("sim/mpm/walls.py", None, {"data learning", "data test", *LEARNED, *COMPARED}),
     ("sim/mpm/solver.py", None, {"data learning", "data test", *LEARNED, *COMPARED}),
+    ("sim/sph/wcsph.py", None, set()),  # the puddle is material points'
+    ("sim/pbd/solver.py", None, set()),
     ("learn/gns.py", None, {"train gns", *COMPARED}),
     ("learn/grid_emulator.py", None, {"train grid", *COMPARED}),
     ("learn/train.py", None, LEARNED),
+    ("learn/metrics.py", None, {*LEARNED, *COMPARED, "report"}),  # trainings choose their best weights by it
     ("learn/compare.py", None, COMPARED | {"report"}),
     ("learn/report_template.html", None, {"report"}),
     ("learn/generalisation.py", None, {"report"}),

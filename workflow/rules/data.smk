@@ -17,6 +17,11 @@ def generate_commands(part):
     return commands
 
 
+def requested(key, default):
+    """A resource of a data set, for the scheduler."""
+    return lambda wildcards: STUDY.resource("data", wildcards.data, key, default)
+
+
 # What is learnt from goes first, then the trainings, then all that can be done beside them on the cores that are left.
 rule learning_data:
     output:
@@ -28,10 +33,10 @@ rule learning_data:
         f"{RESULTS}/logs/learning_data/{{data}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/learning_data/{{data}}.tsv"
-    threads: 2
+    threads: requested("threads", 2)
     resources:
-        mem_mb=2000,
-        runtime=60,
+        mem_mb=lambda wildcards, threads: STUDY.resource("data", wildcards.data, "mem_mb", 1000 * threads),
+        runtime=requested("runtime", 60),
     priority: 200
     message:
         "Generating {wildcards.data} to learn from (progress in {log})"
@@ -49,7 +54,7 @@ use rule learning_data as test_data with:
         f"{RESULTS}/logs/test_data/{{data}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/test_data/{{data}}.tsv"
-    threads: 1
+    threads: requested("threads", 1)
     priority: 0
     message:
         "Generating {wildcards.data} to test on (progress in {log})"
