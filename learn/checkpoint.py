@@ -73,6 +73,8 @@ def read_content(path: str | Path, device: torch.device | str, form: str, remedy
                 with zipfile.ZipFile(path) as archive:
                     if sum(entry.file_size for entry in archive.infolist()) > path.stat().st_size:
                         raise ValueError("it promises more than it holds")
+                    if (spoilt := archive.testzip()) is not None:  # torch writes checksums and does not look at them
+                        raise ValueError(f"{spoilt} has not the checksum that it was written with")
             content = torch.load(path, map_location=device, weights_only=True)
         if (count := entries(content)) > MOST_ENTRIES:
             raise ValueError(f"its parts refer to each other, {count:.3g} entries in all")

@@ -283,6 +283,18 @@ def test_a_packed_bomb(tmp_path: Path, runs: dict[str, Path]) -> None:
     assert code == 2 and "promises more than it holds" in error
 
 
+def test_a_flipped_bit_among_the_weights(tmp_path: Path, runs: dict[str, Path]) -> None:
+    """One weight is another number, finite as before: the checksum of its tensor tells."""
+    path = runs["gns"] / "best.pt"
+    weights = torch.load(path, weights_only=True)["state_dict"]
+    bytes_of_one = next(value for value in weights.values() if value.numel() > 10).numpy().tobytes()
+    raw = bytearray(path.read_bytes())
+    raw[raw.index(bytes_of_one) + 5] ^= 1
+    (tmp_path / "best.pt").write_bytes(raw)
+    code, error = told(main, "info", tmp_path / "best.pt")
+    assert code == 2 and "has not the checksum" in error, error
+
+
 def test_a_plain_pickle(tmp_path: Path) -> None:
     (tmp_path / "best.pt").write_bytes(pickle.dumps(Payload(os.mkdir, str(tmp_path / "mark"))))
     assert told(main, "info", tmp_path / "best.pt")[0] == 2 and os.listdir(tmp_path) == ["best.pt"]
