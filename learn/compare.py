@@ -577,7 +577,24 @@ def _names(names: Sequence[str]) -> str:
     return names[0] if len(names) == 1 else ", ".join(names[:-1]) + " and " + names[-1]
 
 
-def _scene_verdict(rows: list[dict], yardstick: Yardstick) -> str:
+def best_learned(analysed: Sequence[dict]) -> dict | None:
+    """The entry of ``analyse`` that one scene and reference are judged by; None if no learned model finished every rollout.
+
+    Models that beat the trivial baselines come first, then one that no rung matches, then the largest ratio at equal error.
+    """
+    judged = [entry for entry in analysed if entry["equal_error"]["outcome"] != "failed"]
+    return max(judged, key=lambda entry: (not entry["worse_than_trivial"], entry["equal_error"]["ratio"] or math.inf), default=None)
+
+
+def by_scene(rows: Sequence[dict]) -> dict[tuple[str, str], list[dict]]:
+    """Rows, or entries of ``analyse``, by (scene, reference): what can be compared with each other."""
+    groups: dict[tuple[str, str], list[dict]] = {}
+    for row in rows:
+        groups.setdefault((row["scene"], row["reference"]), []).append(row)
+    return groups
+
+
+def scene_verdict(rows: list[dict], yardstick: Yardstick = MOVING_MSE) -> str:
     """Sentences on the rows of one scene and reference."""
     first = rows[0]
     where = (
@@ -586,15 +603,13 @@ def _scene_verdict(rows: list[dict], yardstick: Yardstick) -> str:
     )
     analysed = analyse(rows, yardstick)
     by_name = {row["contender"]: row for row in rows}
-    judged = [entry for entry in analysed if entry["equal_error"]["outcome"] != "failed"]
+    best = best_learned(analysed)
     sentences = []
     if not analysed:
         sentences.append(f"{where}, no learned model was compared.")
-    elif not judged:
+    elif best is None:
         sentences.append(f"{where}, no learned model wins: none finished every rollout.")
     else:
-        # Models that beat the trivial baselines come first, then one that no rung matches, then the largest ratio.
-        best = max(judged, key=lambda entry: (not entry["worse_than_trivial"], entry["equal_error"]["ratio"] or math.inf))
         sentences += _best_model(where, best, by_name)
     for row in rows:
         if row["failures"]:
@@ -643,12 +658,44 @@ def _best_model(where: str, best: dict, by_name: dict[str, dict]) -> list[str]:
     return sentences
 
 
+def _headline(groups: dict[tuple[str, str], list[dict]], yardstick: Yardstick) -> list[str]:
+    """On how many of several scenes a learned model wins at equal error, which and by how much; how the others fall short."""
+    scenes = [scene for scene, _ in groups]
+    where: dict[str, list[str]] = {}
+    ratios: dict[str, list[tuple[float, str, str]]] = {}
+    for (scene, reference), rows in groups.items():
+        place = scene if scenes.count(scene) == 1 else f"{scene} (truth: {reference})"
+        analysed = analyse(rows, yardstick)
+        best = best_learned(analysed)
+        outcome = best["equal_error"]["outcome"] if best else "failed" if analysed else "none"
+        where.setdefault(outcome, []).append(place)
+        if best and best["equal_error"]["ratio"]:
+            ratios.setdefault(outcome, []).append((best["equal_error"]["ratio"], best["contender"], place))
+    wins = [f"{model} on {place}, {ratio:.2g} times faster than the solver" for ratio, model, place in ratios.get("wins", [])]
+    if wins:
+        sentences = [f"At equal error ({yardstick}) a learned model wins on {len(wins)} of {len(groups)} scenes: {'; '.join(wins)}."]
+    else:
+        sentences = [f"No learned model wins at equal error ({yardstick}) on any of the {len(groups)} scenes."]
+    if "loses" in where:
+        ratio, model, place = max(ratios["loses"])
+        lost = f"{len(where['loses'])} the solver is faster" if wins else f"{len(where['loses'])} the best loses to the solver"
+        sentences.append(f"On {lost}, by the least on {place}, where it is {1 / ratio:.2g} times as fast as {model}.")
+    for outcome, text in (
+        ("ties", "the best ties with the solver within the spread of the timings"), ("no rung", "no solver rung that was timed is as accurate"),
+        ("worse than trivial", "the best is worse than a trivial baseline"), ("failed", "none finished every rollout"),
+        ("none", "no learned model was compared"),
+    ):
+        if outcome in where:
+            sentences.append(f"On {_names(where[outcome])} {text}.")
+    return sentences
+
+
 def verdict(rows: list[dict], targets: Sequence[Target] = (), yardstick: Yardstick = MOVING_MSE) -> str:
-    """The first paragraph of a report, from figures alone: who wins at equal error and by how much, on what, at what cost, what was missed."""
-    groups: dict[tuple[str, str], list[dict]] = {}
-    for row in rows:
-        groups.setdefault((row["scene"], row["reference"]), []).append(row)
-    sentences = [_scene_verdict(group, yardstick) for group in groups.values()]
+    """The first paragraph of a report, from figures alone: who wins at equal error and by how much, on what, at what cost, what was missed.
+
+    Of several scenes it is a count, with what stands out; ``scene_verdict`` says the rest."""
+    groups = by_scene(rows)
+    sentences = _headline(groups, yardstick) if len(groups) > 1 else [scene_verdict(rows, yardstick)]
     missed = missed_targets(rows, targets)
     if missed:
         sentences.append(f"Missed: {'; '.join(missed)}.")
