@@ -21,15 +21,16 @@ class Domain:
     rollout_mse: float
     velocity_std: tuple[float, ...] | None = None
     acceleration_std: tuple[float, ...] | None = None
+    dim: int = 2
 
 
 #: By the name of our scene. The container's edge is about 1 in the MPM domains' files, and about 10 in the paper's discussion of errors.
 DOMAINS = {
-    "water_3d": Domain(13000, 800, 0.005, 0.035, 230_000, 1000, 8.66e-9, 10.1e-3),
-    "sand_3d": Domain(20000, 350, 0.0025, 0.025, 320_000, 1000, 1.42e-9, 0.554e-3),
-    "goop_3d": Domain(14000, 300, 0.0025, 0.025, 230_000, 1000, 1.32e-9, 0.618e-3),
-    "water_3d_s": Domain(5800, 800, 0.005, 0.045, 100_000, 1000, 9.66e-9, 9.52e-3),
-    "boxbath": Domain(1000, 150, 0.0167, 0.08, 17_000, 2700, 54.5e-9, 4.2e-3),
+    "water_3d": Domain(13000, 800, 0.005, 0.035, 230_000, 1000, 8.66e-9, 10.1e-3, dim=3),
+    "sand_3d": Domain(20000, 350, 0.0025, 0.025, 320_000, 1000, 1.42e-9, 0.554e-3, dim=3),
+    "goop_3d": Domain(14000, 300, 0.0025, 0.025, 230_000, 1000, 1.32e-9, 0.618e-3, dim=3),
+    "water_3d_s": Domain(5800, 800, 0.005, 0.045, 100_000, 1000, 9.66e-9, 9.52e-3, dim=3),
+    "boxbath": Domain(1000, 150, 0.0167, 0.08, 17_000, 2700, 54.5e-9, 4.2e-3, dim=3),
     "water": Domain(1900, 1000, 0.0025, 0.015, 31_000, 1000, 2.82e-9, 17.4e-3),
     "sand": Domain(2000, 320, 0.0025, 0.015, 21_000, 1000, 6.23e-9, 2.37e-3, (2.198e-3, 2.665e-3), (2.583e-4, 2.955e-4)),
     "goop": Domain(1900, 400, 0.0025, 0.015, 19_000, 1000, 2.91e-9, 1.89e-3),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import importlib
 import io
 import math
@@ -10,9 +9,9 @@ from collections.abc import Mapping, Sequence
 from itertools import groupby
 from pathlib import Path
 
-import jinja2
 import numpy as np
 
+from sim.page import data_uri, render
 from sim.stability import BOUND, Cell
 from sim.trajectory import atomic_path
 
@@ -134,7 +133,7 @@ def curve_figure(rows: Sequence[Mapping]):
 def _uri(figure) -> str:
     data = io.BytesIO()
     figure.savefig(data, format="svg")
-    return f"data:image/svg+xml;base64,{base64.b64encode(data.getvalue()).decode()}"
+    return data_uri(data.getvalue(), ".svg")
 
 
 def _shown(numbers: Mapping) -> str:
@@ -155,13 +154,11 @@ def write_report(summary: Mapping, path: str | Path) -> None:
         wrong = sum(not one["right"] for one in rows)
         # The cells of a map are told by its picture; the table holds those that went wrong and the adaptive runs.
         listed = [one for one in rows if not one["right"] or "courant" not in one["numbers"]] if case in MAPS else rows
-        sections.append({"title": title(case), "rows": listed, "pictures": pictures, "cells": len(rows), "wrong": wrong,
+        sections.append({"case": case, "title": title(case), "rows": listed, "pictures": pictures, "cells": len(rows), "wrong": wrong,
                          "seconds": sum(one["seconds"] for one in rows)})  # fmt: skip
-    loader = jinja2.FileSystemLoader(Path(__file__).parent)
-    environment = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    page = environment.get_template("report_template.html").render(
-        title=summary["title"], verdict=summary["verdict"], sections=sections, shown=_shown,
-        provenance={name: summary[name] for name in ("hardware", "versions", "provenance")},
+    page = render(
+        Path(__file__).parent / "report_template.html", title=summary["title"], verdict=summary["verdict"], sections=sections, shown=_shown,
+        provenance={name: summary[name] for name in ("hardware", "versions")} | {"how to repeat": summary["provenance"]},
     )
     with atomic_path(path) as temporary:
-        temporary.write_bytes(page.encode())
+        temporary.write_bytes(page)
