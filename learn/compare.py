@@ -21,6 +21,7 @@ from typing import Literal
 import numpy as np
 
 from learn import metrics
+from learn.units import duration, number
 from sim import periodic
 from sim.errors import InputError
 from sim.simulator import Rollout, SimulationError, Simulator, Start, rollout, start_from
@@ -569,10 +570,6 @@ def missed_targets(rows: list[dict], targets: Sequence[Target]) -> list[str]:
     return missed
 
 
-def _seconds(value: float) -> str:
-    return f"{value * 1e3:.3g} ms" if value < 1 else f"{value:.3g} s"
-
-
 def _names(names: Sequence[str]) -> str:
     return names[0] if len(names) == 1 else ", ".join(names[:-1]) + " and " + names[-1]
 
@@ -624,7 +621,7 @@ def scene_verdict(rows: list[dict], yardstick: Yardstick = MOVING_MSE) -> str:
 def _best_model(where: str, best: dict, by_name: dict[str, dict]) -> list[str]:
     """Who wins at equal error and by how much, at what training cost."""
     equal, name, row = best["equal_error"], best["contender"], by_name[best["contender"]]
-    its = f"{name} takes {_seconds(best['seconds_per_frame'])} a frame at an error of {best['error']:.2g}"
+    its = f"{name} takes {duration(best['seconds_per_frame'])} a frame at an error of {number(best['error'])}"
     sentences = []
     if best["worse_than_trivial"]:
         sentences.append(f"{where}, no learned model wins: {its}, worse than the trivial {_names(best['worse_than_trivial'])}.")
@@ -633,28 +630,28 @@ def _best_model(where: str, best: dict, by_name: dict[str, dict]) -> list[str]:
     else:
         rung, ratio = by_name[equal["rung"]], equal["ratio"]
         if equal["outcome"] == "wins":
-            who = f"{name} wins at equal error, {ratio:.2g} times faster than the solver"
+            who = f"{name} wins at equal error, {number(ratio)} times faster than the solver"
         elif equal["outcome"] == "ties":
             who = f"no learned model wins at equal error; {name} ties with the solver within the spread of the timings"
         else:
-            who = f"no learned model wins at equal error; the solver is {1 / ratio:.2g} times faster than the best, {name}"
-        match = f"{rung['contender']}, the cheapest solver rung at least as accurate, {_seconds(rung['seconds_per_frame'])}"
+            who = f"no learned model wins at equal error; the solver is {number(1 / ratio)} times faster than the best, {name}"
+        match = f"{rung['contender']}, the cheapest solver rung at least as accurate, {duration(rung['seconds_per_frame'])}"
         if rung["kind"] == "reference":
             match += " (it is the reference itself: no cheaper rung reaches that error)"
         sentences.append(f"{where}, {who}: {its}, {match}.")
     if best["speed_up_paper"] is not None:
-        sentences.append(f"Against the reference, accuracy aside, {name} is {best['speed_up_paper']:.2g} times as fast.")
+        sentences.append(f"Against the reference, accuracy aside, {name} is {number(best['speed_up_paper'])} times as fast.")
     cost = row.get("cost")
     if cost:
         data = f" on {cost['trajectories']} trajectories" if cost.get("trajectories") else ""
-        sentence = f"It was trained{data} for {_seconds(cost['training_seconds'])}, after {_seconds(cost['generation_seconds'])} of data generation"
+        sentence = f"It was trained{data} for {duration(cost['training_seconds'])}, after {duration(cost['generation_seconds'])} of data generation"
         if best["break_even"] == "never":
             sentence += ", which is never paid back at equal error"
         elif best["break_even"] is not None:
             sentence += f", paid back at equal error after {math.ceil(best['break_even'])} rollouts"
         sentences.append(sentence + ".")
     if best["over_floor"]["all"] is not None:
-        sentences.append(f"Its MSE over all frames is {best['over_floor']['all']:.2g} times the chaos floor.")
+        sentences.append(f"Its MSE over all frames is {number(best['over_floor']['all'])} times the chaos floor.")
     return sentences
 
 
@@ -671,7 +668,7 @@ def _headline(groups: dict[tuple[str, str], list[dict]], yardstick: Yardstick) -
         where.setdefault(outcome, []).append(place)
         if best and best["equal_error"]["ratio"]:
             ratios.setdefault(outcome, []).append((best["equal_error"]["ratio"], best["contender"], place))
-    wins = [f"{model} on {place}, {ratio:.2g} times faster than the solver" for ratio, model, place in ratios.get("wins", [])]
+    wins = [f"{model} on {place}, {number(ratio)} times faster than the solver" for ratio, model, place in ratios.get("wins", [])]
     if wins:
         sentences = [f"At equal error ({yardstick}) a learned model wins on {len(wins)} of {len(groups)} scenes: {'; '.join(wins)}."]
     else:
@@ -679,7 +676,7 @@ def _headline(groups: dict[tuple[str, str], list[dict]], yardstick: Yardstick) -
     if "loses" in where:
         ratio, model, place = max(ratios["loses"])
         lost = f"{len(where['loses'])} the solver is faster" if wins else f"{len(where['loses'])} the best loses to the solver"
-        sentences.append(f"On {lost}, by the least on {place}, where it is {1 / ratio:.2g} times as fast as {model}.")
+        sentences.append(f"On {lost}, by the least on {place}, where it is {number(1 / ratio)} times as fast as {model}.")
     for outcome, text in (
         ("ties", "the best ties with the solver within the spread of the timings"), ("no rung", "no solver rung that was timed is as accurate"),
         ("worse than trivial", "the best is worse than a trivial baseline"), ("failed", "none finished every rollout"),
