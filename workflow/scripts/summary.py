@@ -1,4 +1,4 @@
-"""``summary.json`` and ``report.html`` of a study. ``python -m workflow.scripts.summary STUDY SUMMARY REPORT``"""
+"""``summary.json``, ``report.html`` and the pages of ``report/`` beside it. ``python -m workflow.scripts.summary STUDY SUMMARY REPORT``"""
 
 from learn.report import write_report
 from sim.trajectory import write_json
