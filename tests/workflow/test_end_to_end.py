@@ -13,6 +13,7 @@ import time
 from pathlib import Path
 
 import pytest
+from browser import check, needs_browser
 from study_tree import begin_snakemake, make_tree, planned, promised, snakemake
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
@@ -64,12 +65,36 @@ def test_the_yardsticks_are_in_order(summary):
     assert "Missed: gns on puddle" in summary["verdict"]
 
 
-def test_the_report_stands_alone(finished, summary):
-    page = (finished / "results" / "micro" / "report.html").read_text()
-    text = re.sub(r"<[^>]+>|\s+", " ", page)
+def test_the_report_stands_alone_and_has_a_page_a_scene(finished, summary):
+    results = finished / "results" / "micro"
+    entry, page = (results / "report.html").read_text(), (results / "report" / "puddle.html").read_text()
+    text = re.sub(r"<[^>]+>|\s+", " ", entry)
     assert summary["verdict"][:60] in text.replace("&#39;", "'")
-    assert not re.findall(r"""(?:src|href|poster)=["'](?!data:|#)""", page) and "<script" not in page and "@import" not in page
-    assert page.count("data:video/mp4") == 1 and page.count("data:image/svg+xml") >= 4 and page.count("data:image/png") >= 2
+    for each in (entry, page):
+        assert not re.findall(r"""(?:src|poster)=["'](?!data:)""", each) and "<script" not in each and "@import" not in each
+    assert set(re.findall(r'href="([^"]*)"', entry)) == {"report/puddle.html"} and 'id="puddle"' in entry and 'id="provenance"' in entry
+    assert set(re.findall(r'href="([^"]*)"', page)) == {"../report.html#puddle", "../report.html#provenance"}
+    assert entry.count("data:video/mp4") == 0 and entry.count("data:image/svg+xml") == 1 and entry.count("data:image/png") == 1
+    assert page.count("data:video/mp4") == 1 and page.count("data:image/svg+xml") == 4 and page.count("data:image/png") == 2
+    ones = ("learning_data", "test_data", "errors", "timing", "rollouts", "film", "strip", "figures", "training_curve")
+    assert {job["rule"]: job["jobs"] for job in summary["jobs"]} == dict.fromkeys(ones, 1) | {"train": 2}
+    assert "micro_gns.yaml" in text and "snakemake --config study=configs/studies/micro.yaml" in text
+
+
+@needs_browser
+def test_the_report_in_a_browser(finished, tmp_path):
+    results = finished / "results" / "micro"
+    assert len(check(results / "report.html", tmp_path).media) == 2
+    assert len(check(results / "report" / "puddle.html", tmp_path).media) == 7  # the film's poster is one of them
+
+
+def test_snakemake_makes_a_report_of_its_own(finished, tmp_path):
+    code, output = snakemake(finished, "--report", str(tmp_path / "own.html"))
+    assert code == 0 and "downloading" not in output, output
+    page = (tmp_path / "own.html").read_text()
+    for name in ("report.html", "puddle.html", "grid.mp4", "error_over_run_time.svg"):
+        assert f"filename={name};" in page, name
+    assert "seconds a frame, one thread each" in page
 
 
 def test_every_job_leaves_log_and_benchmark(finished):
@@ -298,5 +323,7 @@ def test_a_checkpoint_is_compared_without_training(copied):
     (row,) = [row for row in made["rows"] if row["kind"] == "learned"]
     assert row["contender"] == "shipped" and row["status"] == "ok" and row["cost"]["steps"] == 300
     page = (copied / "results" / "shipped" / "report.html").read_text()
-    assert "data:video" not in page and page.count("data:image/svg+xml") == 5  # four figures and the curve of the shipped training
+    assert "data:video" not in page and page.count("data:image/svg+xml") == 2  # what is beyond the training, error over run time
+    scene = (copied / "results" / "shipped" / "report" / "puddle.html").read_text()
+    assert "data:video" not in scene and scene.count("data:image/svg+xml") == 5  # four figures and the curve of the shipped training
     assert "Median MSE of the rollout, and as a multiple of the best trivial baseline&#39;s. shipped: puddle" in page
