@@ -676,7 +676,7 @@ def _headline(groups: dict[tuple[str, str], list[dict]], yardstick: Yardstick) -
     if "loses" in where:
         ratio, model, place = max(ratios["loses"])
         lost = f"{len(where['loses'])} the solver is faster" if wins else f"{len(where['loses'])} the best loses to the solver"
-        sentences.append(f"On {lost}, by the least on {place}, where it is {number(1 / ratio)} times as fast as {model}.")
+        sentences.append(f"On {lost}, by the least on {place}, where {model} takes {number(1 / ratio)} times as long.")
     for outcome, text in (
         ("ties", "the best ties with the solver within the spread of the timings"), ("no rung", "no solver rung that was timed is as accurate"),
         ("worse than trivial", "the best is worse than a trivial baseline"), ("failed", "none finished every rollout"),

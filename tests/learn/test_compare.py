@@ -348,7 +348,7 @@ def test_the_verdict_on_several_scenes_counts():
     loses = elsewhere("sand", row("gns", "learned", 1e-3, 8.0)) + elsewhere("goop", row("grid", "learned", 1e-3, 2.0))
     text = c.verdict(loses)
     assert text.startswith("No learned model wins at equal error (rollout MSE of moving particles over all frames) on any of the 2 scenes.")
-    assert text.endswith("On 2 the best loses to the solver, by the least on goop, where it is 2 times as fast as grid.")
+    assert text.endswith("On 2 the best loses to the solver, by the least on goop, where grid takes 2 times as long.")
     more = (
         elsewhere("water", row("gns", "learned", 5e-5, 0.8)) + elsewhere("snow", row("gns", "learned", 0.5, 0.1))
         + elsewhere("jelly", row("gns", "learned", None, 0.1, failures=10)) + elsewhere("mud", row("gns", "learned", 1e-3, 0.9, spread=0.2))
@@ -357,7 +357,7 @@ def test_the_verdict_on_several_scenes_counts():
     text = c.verdict(loses + more, [missed])
     assert text.startswith(
         "At equal error (rollout MSE of moving particles over all frames) a learned model wins on 1 of 6 scenes: gns on water, 5 times faster than "
-        "the solver. On 2 the solver is faster, by the least on goop, where it is 2 times as fast as grid. On mud the best ties with the solver"
+        "the solver. On 2 the solver is faster, by the least on goop, where grid takes 2 times as long. On mud the best ties with the solver"
     )
     assert "On snow the best is worse than a trivial baseline. On jelly none finished every rollout. Missed: gns on snow" in text
 
