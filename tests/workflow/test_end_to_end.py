@@ -272,7 +272,7 @@ def test_killed_at_random_instants_it_ends_with_the_same_results(finished, tmp_p
 
 
 def test_the_report_on_a_full_disk(finished, tmp_path):
-    """Under the summary, then under the page: one line in the job's log, nothing half written, and with room the same page."""
+    """Under the summary, the pages, the entry: one line in the job's log, nothing half written, and with room the same pages."""
     made, disk = finished / "results" / "micro", tmp_path / "disk"
     command = [sys.executable, "-m", "workflow.scripts.summary", "configs/studies/micro.yaml", disk / "summary.json", disk / "report.html"]
 
@@ -281,13 +281,18 @@ def test_the_report_on_a_full_disk(finished, tmp_path):
         return done.returncode, done.stderr
 
     with small_disk(disk) as leave:
-        for free, name, left in ((4096, "summary.json", []), (64 * 4096, "report.html", ["summary.json"])):
+        summary, page, entry = ((made / name).stat().st_size for name in ("summary.json", "report/puddle.html", "report.html"))
+        for free, name, left in (
+            (4096, "summary.json", []), (summary + page // 2, "report", ["summary.json"]),
+            (page + entry // 2, "report.html", ["summary.json", "report"]),  # the summary is there, and makes way for its like
+        ):
             leave(free)
             assert write() == (1, f"sluice: {disk / name}: No space left on device\n")
             assert sorted(os.listdir(disk)) == sorted(["filler", *left])
         leave(None)
         assert write() == (0, "")
-        assert (disk / "report.html").read_bytes() == (made / "report.html").read_bytes()
+        for name in ("report.html", "report/puddle.html"):
+            assert (disk / name).read_bytes() == (made / name).read_bytes()
 
 
 # A shipped checkpoint -------------------------------------------------------------------------------------------------------
