@@ -439,13 +439,16 @@ def _page(scene: Mapping, media: SceneAssets) -> dict:
     }
 
 
-def write_report(summary: Mapping, path: str | Path, assets: Mapping[str, SceneAssets] | None = None) -> None:
+def write_report(
+    summary: Mapping, path: str | Path, assets: Mapping[str, SceneAssets] | None = None, overview: Sequence[Asset] = (),
+) -> None:
     """Write the entry to ``path`` (NAME.html), last, and a page for every scene and reference to the folder NAME beside it, which is replaced.
 
     summary: as in ``learn.compare`` with "rows", "verdict" (the first paragraph), "hardware", "versions"; optional "title", "analysis" (by
     ``analyse``; made from the rows if absent), "jobs" (what the workflow's steps took: rule, jobs, seconds, longest_seconds, memory_mb) and
-    "provenance" (name -> text, list or mapping: commands, seeds, revision, ...). assets: scene -> its pictures, which go with its first page.
-    ``InputError``, and nothing written, for a summary without rows or verdict and for pictures that cannot be read.
+    "provenance" (name -> text, list or mapping: commands, seeds, revision, ...). assets: scene -> its pictures, which go with its first page;
+    overview: pictures of all scenes together, for the entry. ``InputError``, and nothing written, for a summary without rows or verdict and for
+    pictures that cannot be read; ``OSError``.
     """
     path, rows = Path(path), summary.get("rows")
     if not rows:
@@ -460,7 +463,7 @@ def write_report(summary: Mapping, path: str | Path, assets: Mapping[str, SceneA
     provenance = {name: summary.get(name) or {} for name in ("hardware", "versions")} | (summary.get("provenance") or {})
     here = Path(__file__).parent
     entry = render(
-        here / "report_template.html", title=title, verdict=summary["verdict"], folder=folder.name, pages=pages,
+        here / "report_template.html", title=title, verdict=summary["verdict"], folder=folder.name, pages=pages, overview=_embed(overview),
         glance=_glance(scenes, folder.name), published=_published(scenes), costs=_all_costs(rows),
         jobs=_jobs(summary["jobs"]) if summary.get("jobs") else None, provenance={name: content for name, content in provenance.items() if content},
     )

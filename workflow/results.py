@@ -138,6 +138,12 @@ def _generalisation(study: Study, comparison: str, summary: dict) -> str:
     return f"Beyond the training. Median MSE of the rollout, and as a multiple of the best trivial baseline's. {' '.join(said)}"
 
 
+def overview(study: Study) -> list[Asset]:
+    """Pictures of all scenes together."""
+    caption = "Each learned model's speed-up at equal error, filled, and over the reference, as papers usually count it, hollow."
+    return [Asset(path, caption) for path in study.overview]
+
+
 def assets(study: Study, summary: dict) -> dict[str, SceneAssets]:
     """Scene -> its pictures, as the rules made them."""
     result = {}

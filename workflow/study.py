@@ -136,6 +136,11 @@ class Study:
         names += [f"{figure}.svg" for figure in FIGURES] + ["training.svg"] * bool(self.training_runs(comparison))
         return [self.picture(comparison, name) for name in names]
 
+    @property
+    def overview(self) -> list[Path]:
+        """What a report shows of all comparisons together."""
+        return [self.folder / "pictures" / "speed_ups.svg"] * any(entry["learned"] for entry in self.comparisons.values())
+
     def generalised(self, comparison: str) -> list[str]:
         """The comparisons whose trajectories its figure of generalisation draws, its own first."""
         return [comparison, *self.comparisons[comparison]["generalisation"].get("with", [])]

@@ -117,11 +117,11 @@ class Page(HTMLParser):
         return {row[0].split(" | ")[0]: row for row in found}
 
 
-def write(tmp_path, rows, assets=None, page="hand", **more):
+def write(tmp_path, rows, assets=None, page="hand", overview=(), **more):
     """Text and tags of a scene's page, or of the entry (None)."""
     summary = compare.summary(rows) | {"verdict": VERDICT} | more
     json.dumps(summary, allow_nan=False)
-    report.write_report(summary, tmp_path / "report.html", assets)
+    report.write_report(summary, tmp_path / "report.html", assets, overview)
     text = (tmp_path / ("report.html" if page is None else f"report/{page}.html")).read_text(encoding="utf-8")
     return text, Page(text)
 
@@ -139,9 +139,11 @@ def check_self_contained(text, page, count):
 
 def test_the_entry_stands_alone_and_begins_with_the_verdict(tmp_path, rows, assets):
     provenance = {"commands": ["make demo"], "seeds": {"train": [1, 2]}, "revision": "abc1"}
-    text, page = write(tmp_path, rows, assets, None, title="Sand & water", provenance=provenance)
+    overview = [report.Asset(tmp_path / "figure.svg", "speed-ups")]
+    text, page = write(tmp_path, rows, assets, None, overview, title="Sand & water", provenance=provenance)
     assert page.paragraphs[0] == VERDICT
-    still, main = check_self_contained(text, page, 2)
+    first, still, main = check_self_contained(text, page, 3)
+    assert first["alt"] == "speed-ups"
     assert still["src"].startswith("data:image/png") and still["alt"] == "solver, model, error Half way."
     assert main["src"].startswith("data:image/svg+xml") and main["alt"] == 'error "over" <run time>'
     for expected in ("Sand &amp; water", "make demo", "<dt>train</dt><dd>1, 2</dd>", "abc1", "numpy", "10 predicted frames of 10 ms"):

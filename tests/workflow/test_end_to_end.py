@@ -27,7 +27,7 @@ ROW_KEYS = {
     "seconds_per_simulated_second", "compile_seconds", "spread",
 }
 KINDS = {"reference": 1, "solver": 2, "learned": 2, "trivial": 5, "oracle": 1, "floor": 1}
-PICTURES = {"figures", "film", "strip", "training_curve"}
+PICTURES = {"figures", "speed_ups", "film", "strip", "training_curve"}
 
 
 def refuse(constant: str):
@@ -74,7 +74,7 @@ def test_the_report_stands_alone_and_has_a_page_a_scene(finished, summary):
         assert not re.findall(r"""(?:src|poster)=["'](?!data:)""", each) and "<script" not in each and "@import" not in each
     assert set(re.findall(r'href="([^"]*)"', entry)) == {"report/puddle.html"} and 'id="puddle"' in entry and 'id="provenance"' in entry
     assert set(re.findall(r'href="([^"]*)"', page)) == {"../report.html#puddle", "../report.html#provenance"}
-    assert entry.count("data:video/mp4") == 0 and entry.count("data:image/svg+xml") == 1 and entry.count("data:image/png") == 1
+    assert entry.count("data:video/mp4") == 0 and entry.count("data:image/svg+xml") == 2 and entry.count("data:image/png") == 1
     assert page.count("data:video/mp4") == 1 and page.count("data:image/svg+xml") == 4 and page.count("data:image/png") == 2
     ones = ("learning_data", "test_data", "errors", "timing", "rollouts", "film", "strip", "figures", "training_curve")
     assert {job["rule"]: job["jobs"] for job in summary["jobs"]} == dict.fromkeys(ones, 1) | {"train": 2}
@@ -84,7 +84,7 @@ def test_the_report_stands_alone_and_has_a_page_a_scene(finished, summary):
 @needs_browser
 def test_the_report_in_a_browser(finished, tmp_path):
     results = finished / "results" / "micro"
-    assert len(check(results / "report.html", tmp_path).media) == 2
+    assert len(check(results / "report.html", tmp_path).media) == 3
     assert len(check(results / "report" / "puddle.html", tmp_path).media) == 7  # the film's poster is one of them
 
 
@@ -92,7 +92,7 @@ def test_snakemake_makes_a_report_of_its_own(finished, tmp_path):
     code, output = snakemake(finished, "--report", str(tmp_path / "own.html"))
     assert code == 0 and "downloading" not in output, output
     page = (tmp_path / "own.html").read_text()
-    for name in ("report.html", "puddle.html", "grid.mp4", "error_over_run_time.svg"):
+    for name in ("report.html", "puddle.html", "grid.mp4", "error_over_run_time.svg", "speed_ups.svg"):
         assert f"filename={name};" in page, name
     assert "seconds a frame, one thread each" in page
 
@@ -101,7 +101,7 @@ def test_every_job_leaves_log_and_benchmark(finished):
     results = finished / "results" / "micro"
     logs = {path.relative_to(results / "logs").with_suffix("") for path in (results / "logs").rglob("*.log")}
     benchmarks = {path.relative_to(results / "benchmarks").with_suffix("") for path in (results / "benchmarks").rglob("*.tsv")}
-    assert logs == benchmarks and len(logs) == 12
+    assert logs == benchmarks and len(logs) == 13
 
 
 def test_nothing_is_made_twice(finished):
@@ -143,12 +143,12 @@ EDITS = {
     ),
     "rendering": (lambda tree: append(tree / "sim" / "render.py"), {"film", "strip", "report"}),
     "template": (lambda tree: append(tree / "learn" / "report_template.html", "<!-- edited -->"), {"report"}),
-    "figures": (lambda tree: append(tree / "learn" / "figures.py"), {"figures", "training_curve", "report"}),
+    "figures": (lambda tree: append(tree / "learn" / "figures.py"), {"figures", "speed_ups", "training_curve", "report"}),
     "report": (lambda tree: append(tree / "learn" / "report.py"), {"report"}),
     "target": (lambda tree: replace(tree / "configs" / "studies" / "micro.yaml", "1.0e-12", "1.0"), {"report"}),
     "rung": (
         lambda tree: replace(tree / "configs" / "studies" / "micro.yaml", "cfl: 0.8", "cfl: 0.9"),
-        {"errors", "timing", "rollouts", "figures", "film", "strip", "report"},
+        {"errors", "timing", "rollouts", "figures", "speed_ups", "film", "strip", "report"},
     ),
 }
 
@@ -328,7 +328,7 @@ def test_a_checkpoint_is_compared_without_training(copied):
     (row,) = [row for row in made["rows"] if row["kind"] == "learned"]
     assert row["contender"] == "shipped" and row["status"] == "ok" and row["cost"]["steps"] == 300
     page = (copied / "results" / "shipped" / "report.html").read_text()
-    assert "data:video" not in page and page.count("data:image/svg+xml") == 2  # what is beyond the training, error over run time
+    assert "data:video" not in page and page.count("data:image/svg+xml") == 3  # speed-ups, beyond the training, error over run time
     scene = (copied / "results" / "shipped" / "report" / "puddle.html").read_text()
     assert "data:video" not in scene and scene.count("data:image/svg+xml") == 5  # four figures and the curve of the shipped training
     assert "Median MSE of the rollout, and as a multiple of the best trivial baseline&#39;s. shipped: puddle" in page

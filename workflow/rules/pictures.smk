@@ -108,6 +108,27 @@ rule figures:
         "{PYTHON} -m workflow.scripts.figures {input.rows} {input.timing} {output} > {log} 2>&1"
 
 
+rule speed_ups:
+    input:
+        [STUDY.comparison_file(comparison, f"{name}.json") for comparison in STUDY.comparisons for name in ("errors", "timing")],
+    output:
+        report(f"{RESULTS}/pictures/speed_ups.svg", caption="../report/speed_ups.rst", category="Report"),
+    params:
+        code=code_hash("workflow.scripts.speed_ups"),
+    log:
+        f"{RESULTS}/logs/speed_ups.log",
+    benchmark:
+        f"{RESULTS}/benchmarks/speed_ups.tsv"
+    threads: 1
+    resources:
+        mem_mb=2000,
+        runtime=10,
+    message:
+        "Figure of the speed-ups"
+    shell:
+        "{PYTHON} -m workflow.scripts.speed_ups {output} {input} > {log} 2>&1"
+
+
 rule ablation:
     input:
         rows=f"{RESULTS}/comparisons/{{comparison}}/errors.json",

@@ -3,7 +3,7 @@
 
 def pictures(wildcards):
     """What the report embeds: see ``workflow.results.assets``."""
-    return [path for comparison in STUDY.comparisons for path in STUDY.pictures(comparison)]
+    return STUDY.overview + [path for comparison in STUDY.comparisons for path in STUDY.pictures(comparison)]
 
 
 rule report:
