@@ -207,7 +207,7 @@ def test_a_domain_of_the_paper_stands_beside_its_table(tmp_path, rows):
     assert gns[4:] == ["– | gns", "– | 1,591,826", "100 | 1,000", "– | 20,000,000", "10 min | –", "10 | 1,000", "10 | 1,000"]
     assert dead[1].startswith("–^") and dead[3].startswith("–^") and dead[8].startswith("–^")
     assert box_gns[3:6] == ["0.095×", "gns | gns", "– | 1,592,979"] and box_gns[-2:] == ["10 | 1,000", "10 | 150"]
-    assert "A factor of 100 may lie between" in text and "None of these scenes" not in text
+    assert "multiplied by 100 to 160" in text and "None of these scenes" not in text
 
 
 def test_what_the_steps_took(tmp_path, rows):
