@@ -12,8 +12,8 @@ import argparse
 
 from mpm import ROOT, save, timed
 
+from sim.domains import DOMAINS
 from sim.generate import SPLITS, simulate, trajectory_seed
-from sim.paper import DOMAINS
 from sim.plan import RATES, plan
 from sim.scene import SceneFamily
 

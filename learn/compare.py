@@ -21,6 +21,7 @@ from typing import Literal
 import numpy as np
 
 from learn import metrics
+from learn.units import duration, number
 from sim import periodic
 from sim.errors import InputError
 from sim.simulator import Rollout, SimulationError, Simulator, Start, rollout, start_from
@@ -569,15 +570,28 @@ def missed_targets(rows: list[dict], targets: Sequence[Target]) -> list[str]:
     return missed
 
 
-def _seconds(value: float) -> str:
-    return f"{value * 1e3:.3g} ms" if value < 1 else f"{value:.3g} s"
-
-
 def _names(names: Sequence[str]) -> str:
     return names[0] if len(names) == 1 else ", ".join(names[:-1]) + " and " + names[-1]
 
 
-def _scene_verdict(rows: list[dict], yardstick: Yardstick) -> str:
+def best_learned(analysed: Sequence[dict]) -> dict | None:
+    """The entry of ``analyse`` that one scene and reference are judged by; None if no learned model finished every rollout.
+
+    Models that beat the trivial baselines come first, then one that no rung matches, then the largest ratio at equal error.
+    """
+    judged = [entry for entry in analysed if entry["equal_error"]["outcome"] != "failed"]
+    return max(judged, key=lambda entry: (not entry["worse_than_trivial"], entry["equal_error"]["ratio"] or math.inf), default=None)
+
+
+def by_scene(rows: Sequence[dict]) -> dict[tuple[str, str], list[dict]]:
+    """Rows, or entries of ``analyse``, by (scene, reference): what can be compared with each other."""
+    groups: dict[tuple[str, str], list[dict]] = {}
+    for row in rows:
+        groups.setdefault((row["scene"], row["reference"]), []).append(row)
+    return groups
+
+
+def scene_verdict(rows: list[dict], yardstick: Yardstick = MOVING_MSE) -> str:
     """Sentences on the rows of one scene and reference."""
     first = rows[0]
     where = (
@@ -586,15 +600,13 @@ def _scene_verdict(rows: list[dict], yardstick: Yardstick) -> str:
     )
     analysed = analyse(rows, yardstick)
     by_name = {row["contender"]: row for row in rows}
-    judged = [entry for entry in analysed if entry["equal_error"]["outcome"] != "failed"]
+    best = best_learned(analysed)
     sentences = []
     if not analysed:
         sentences.append(f"{where}, no learned model was compared.")
-    elif not judged:
+    elif best is None:
         sentences.append(f"{where}, no learned model wins: none finished every rollout.")
     else:
-        # Models that beat the trivial baselines come first, then one that no rung matches, then the largest ratio.
-        best = max(judged, key=lambda entry: (not entry["worse_than_trivial"], entry["equal_error"]["ratio"] or math.inf))
         sentences += _best_model(where, best, by_name)
     for row in rows:
         if row["failures"]:
@@ -609,7 +621,7 @@ def _scene_verdict(rows: list[dict], yardstick: Yardstick) -> str:
 def _best_model(where: str, best: dict, by_name: dict[str, dict]) -> list[str]:
     """Who wins at equal error and by how much, at what training cost."""
     equal, name, row = best["equal_error"], best["contender"], by_name[best["contender"]]
-    its = f"{name} takes {_seconds(best['seconds_per_frame'])} a frame at an error of {best['error']:.2g}"
+    its = f"{name} takes {duration(best['seconds_per_frame'])} a frame at an error of {number(best['error'])}"
     sentences = []
     if best["worse_than_trivial"]:
         sentences.append(f"{where}, no learned model wins: {its}, worse than the trivial {_names(best['worse_than_trivial'])}.")
@@ -618,37 +630,69 @@ def _best_model(where: str, best: dict, by_name: dict[str, dict]) -> list[str]:
     else:
         rung, ratio = by_name[equal["rung"]], equal["ratio"]
         if equal["outcome"] == "wins":
-            who = f"{name} wins at equal error, {ratio:.2g} times faster than the solver"
+            who = f"{name} wins at equal error, {number(ratio)} times faster than the solver"
         elif equal["outcome"] == "ties":
             who = f"no learned model wins at equal error; {name} ties with the solver within the spread of the timings"
         else:
-            who = f"no learned model wins at equal error; the solver is {1 / ratio:.2g} times faster than the best, {name}"
-        match = f"{rung['contender']}, the cheapest solver rung at least as accurate, {_seconds(rung['seconds_per_frame'])}"
+            who = f"no learned model wins at equal error; the solver is {number(1 / ratio)} times faster than the best, {name}"
+        match = f"{rung['contender']}, the cheapest solver rung at least as accurate, {duration(rung['seconds_per_frame'])}"
         if rung["kind"] == "reference":
             match += " (it is the reference itself: no cheaper rung reaches that error)"
         sentences.append(f"{where}, {who}: {its}, {match}.")
     if best["speed_up_paper"] is not None:
-        sentences.append(f"Against the reference, accuracy aside, {name} is {best['speed_up_paper']:.2g} times as fast.")
+        sentences.append(f"Against the reference, accuracy aside, {name} is {number(best['speed_up_paper'])} times as fast.")
     cost = row.get("cost")
     if cost:
         data = f" on {cost['trajectories']} trajectories" if cost.get("trajectories") else ""
-        sentence = f"It was trained{data} for {_seconds(cost['training_seconds'])}, after {_seconds(cost['generation_seconds'])} of data generation"
+        sentence = f"It was trained{data} for {duration(cost['training_seconds'])}, after {duration(cost['generation_seconds'])} of data generation"
         if best["break_even"] == "never":
             sentence += ", which is never paid back at equal error"
         elif best["break_even"] is not None:
             sentence += f", paid back at equal error after {math.ceil(best['break_even'])} rollouts"
         sentences.append(sentence + ".")
     if best["over_floor"]["all"] is not None:
-        sentences.append(f"Its MSE over all frames is {best['over_floor']['all']:.2g} times the chaos floor.")
+        sentences.append(f"Its MSE over all frames is {number(best['over_floor']['all'])} times the chaos floor.")
+    return sentences
+
+
+def _headline(groups: dict[tuple[str, str], list[dict]], yardstick: Yardstick) -> list[str]:
+    """On how many of several scenes a learned model wins at equal error, which and by how much; how the others fall short."""
+    scenes = [scene for scene, _ in groups]
+    where: dict[str, list[str]] = {}
+    ratios: dict[str, list[tuple[float, str, str]]] = {}
+    for (scene, reference), rows in groups.items():
+        place = scene if scenes.count(scene) == 1 else f"{scene} (truth: {reference})"
+        analysed = analyse(rows, yardstick)
+        best = best_learned(analysed)
+        outcome = best["equal_error"]["outcome"] if best else "failed" if analysed else "none"
+        where.setdefault(outcome, []).append(place)
+        if best and best["equal_error"]["ratio"]:
+            ratios.setdefault(outcome, []).append((best["equal_error"]["ratio"], best["contender"], place))
+    wins = [f"{model} on {place}, {number(ratio)} times faster than the solver" for ratio, model, place in ratios.get("wins", [])]
+    if wins:
+        sentences = [f"At equal error ({yardstick}) a learned model wins on {len(wins)} of {len(groups)} scenes: {'; '.join(wins)}."]
+    else:
+        sentences = [f"No learned model wins at equal error ({yardstick}) on any of the {len(groups)} scenes."]
+    if "loses" in where:
+        ratio, model, place = max(ratios["loses"])
+        lost = f"{len(where['loses'])} the solver is faster" if wins else f"{len(where['loses'])} the best loses to the solver"
+        sentences.append(f"On {lost}, by the least on {place}, where {model} takes {number(1 / ratio)} times as long.")
+    for outcome, text in (
+        ("ties", "the best ties with the solver within the spread of the timings"), ("no rung", "no solver rung that was timed is as accurate"),
+        ("worse than trivial", "the best is worse than a trivial baseline"), ("failed", "none finished every rollout"),
+        ("none", "no learned model was compared"),
+    ):
+        if outcome in where:
+            sentences.append(f"On {_names(where[outcome])} {text}.")
     return sentences
 
 
 def verdict(rows: list[dict], targets: Sequence[Target] = (), yardstick: Yardstick = MOVING_MSE) -> str:
-    """The first paragraph of a report, from figures alone: who wins at equal error and by how much, on what, at what cost, what was missed."""
-    groups: dict[tuple[str, str], list[dict]] = {}
-    for row in rows:
-        groups.setdefault((row["scene"], row["reference"]), []).append(row)
-    sentences = [_scene_verdict(group, yardstick) for group in groups.values()]
+    """The first paragraph of a report, from figures alone: who wins at equal error and by how much, on what, at what cost, what was missed.
+
+    Of several scenes it is a count, with what stands out; ``scene_verdict`` says the rest."""
+    groups = by_scene(rows)
+    sentences = _headline(groups, yardstick) if len(groups) > 1 else [scene_verdict(rows, yardstick)]
     missed = missed_targets(rows, targets)
     if missed:
         sentences.append(f"Missed: {'; '.join(missed)}.")

@@ -229,6 +229,47 @@ def kinetic_energy(rows: Sequence[dict], path: str | Path) -> None:
         _save(figure, path)
 
 
+#: Outcome at equal error -> marker, kind whose colour it has. An outcome without a ratio is words.
+_OUTCOMES = {"wins": ("s", "learned"), "ties": ("D", "learned"), "loses": ("v", "learned"), "worse than trivial": ("X", "trivial")}
+
+
+def speed_ups(analysis: Sequence[dict], path: str | Path) -> None:
+    """Every learned contender of all scenes, a line each: its speed-up at equal error, filled, and over the reference, accuracy aside, hollow.
+
+    analysis: by ``learn.compare.analyse``, of rows whose run times are interleaved. Right of 1 the model is the faster one.
+    """
+    with plt.rc_context(_STYLE):
+        figure, axes = plt.subplots(figsize=(8.5, 1.4 + 0.27 * len(analysis)), layout="constrained")
+        axes.set(xscale="log", xlabel="time of the solver over time of the model (right of 1: the model is faster)", ylim=(len(analysis) - 0.4, -0.6))
+        axes.axvline(1, color=COLOURS["reference"], lw=1.2)
+        axes.grid(False, axis="y")
+        outcomes = [entry["equal_error"]["outcome"] for entry in analysis]
+        for place, (entry, outcome) in enumerate(zip(analysis, outcomes, strict=True)):
+            ratio, paper = entry["equal_error"]["ratio"], entry["speed_up_paper"]
+            if place and entry["scene"] != analysis[place - 1]["scene"]:
+                axes.axhline(place - 0.5, color="#D0D0D0", lw=0.8)
+            if ratio and paper:
+                axes.plot([ratio, paper], [place] * 2, color="#BBBBBB", lw=1, zorder=1)
+            if paper:
+                axes.plot(paper, place, "o", color=COLOURS["reference"], markerfacecolor="white", markersize=6)
+            if ratio:
+                marker, kind = _OUTCOMES[outcome]
+                axes.plot(ratio, place, marker, color=COLOURS[kind], markersize=7, zorder=3)
+            else:
+                axes.text(0.01, place, outcome, transform=axes.get_yaxis_transform(), va="center", fontsize=8.5, color="#555555")
+        axes.set_yticks(range(len(analysis)), [f"{entry['scene']}: {entry['contender']}" for entry in analysis])
+        low, high = axes.get_xlim()
+        axes.set_xlim(min(low, 0.5) / (1 + 3 * (not set(outcomes) <= _OUTCOMES.keys())), max(high, 2))
+        handles = [
+            plt.Line2D([], [], ls="", marker=marker, color=COLOURS[kind], label=f"at equal error: {outcome}")
+            for outcome, (marker, kind) in _OUTCOMES.items() if outcome in outcomes
+        ]
+        paper = "over the reference, accuracy aside"
+        handles.append(plt.Line2D([], [], ls="", marker="o", color=COLOURS["reference"], markerfacecolor="white", label=paper))
+        figure.legend(handles=handles, loc="outside upper center", ncols=2)
+        _save(figure, path)
+
+
 #: Errors that a figure of ablations shows: as the paper's, of one step and of the whole rollout.
 ABLATED = (Yardstick("one_step_mse_moving", None), MOVING_MSE)
 

@@ -1,61 +1,65 @@
-"""The report: one self-contained HTML page from a summary (``learn.compare``), the figures and the films.
+"""The report: an HTML page from a summary (``learn.compare``) and the figures, and beside it a page for every scene, with its films and tables.
 
 Every figure in it comes from the summary; what is missing is an en dash, with the reason as a footnote where the summary knows one.
-Pictures and films are embedded, so that the page can be mailed, archived and read without a network; it holds no script.
+Pictures and films are embedded, so that a page can be mailed, archived and read without a network; it holds no script.
 """
 
 from __future__ import annotations
 
-import base64
 import json
 import math
+import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import groupby
 from pathlib import Path
 
-import jinja2
-
-from learn.compare import analyse, over_floor, pareto_front
+from learn.compare import MOVING_MSE, analyse, best_learned, by_scene, over_floor, pareto_front, scene_verdict
+from learn.units import duration, number
+from sim.domains import DOMAINS, PARAMETERS, TRAINING_STEPS, reproduced
 from sim.errors import InputError
-from sim.trajectory import atomic_path
+from sim.page import file_uri, render, words
+from sim.trajectory import atomic_folder, atomic_path
 
 #: Kinds of contenders in the order of the tables, as headings of the groups.
 KINDS = {
     "reference": "reference", "solver": "solver ladder", "learned": "learned", "trivial": "trivial baselines", "oracle": "oracle",
     "floor": "chaos floor",
 }
-_MEDIA = {".png": "image/png", ".jpg": "image/jpeg", ".jpeg": "image/jpeg", ".svg": "image/svg+xml", ".mp4": "video/mp4"}
 _DASH = "–"
 
 
 @dataclass(frozen=True)
 class Asset:
-    """A picture (.png, .jpg, .svg) or film (.mp4) with its caption; poster: the still that stands for a film until it plays."""
+    """A picture (.png, .jpg, .svg) or film (.mp4) with its caption; poster: the still that stands for a film until it plays; wide: many panels
+    beside each other, which want the whole width of the page."""
 
     path: Path
     caption: str
     poster: Path | None = None
+    wide: bool = False
 
 
 @dataclass(frozen=True)
 class SceneAssets:
-    """What a scene's section shows beside its tables, in this order: films and stills, figures, training curve. All optional."""
+    """What a scene's page shows beside its tables, in this order. All optional."""
 
-    films: Sequence[Asset] = ()
+    films: Sequence[Asset] = ()  # the still of the first stands in the entry
     stills: Sequence[Asset] = ()
-    figures: Sequence[Asset] = ()  # error over run time first, then error over time, kinetic energy
+    main: Sequence[Asset] = ()  # in the entry as well: what the comparison is about, error over run time
+    figures: Sequence[Asset] = ()  # error over time, kinetic energy
     training: Sequence[Asset] = ()
 
 
 @dataclass(frozen=True)
 class _Media:
-    """An asset as the template wants it: data URIs."""
+    """An asset as the template wants it: data URIs; kind: film, chart (which may scroll on a phone, for its small print) or still."""
 
     uri: str
-    film: bool
+    kind: str
     caption: str
     poster: str | None
+    wide: bool
 
 
 @dataclass(frozen=True)
@@ -67,15 +71,27 @@ class _Cell:
     note: int | None = None
 
 
+@dataclass(frozen=True)
+class _Row:
+    """name: the cell that heads the row; heading: of the group that begins with it; tag: a second line; link: where the name leads."""
+
+    name: str
+    cells: list[_Cell]
+    heading: str | None = None
+    tag: str = ""
+    link: str = ""
+
+
 @dataclass
 class _Table:
-    """groups: (name, number of columns) over the columns; rows: (heading or None, name, tag, cells); notes: footnotes, numbered from 1."""
+    """groups: (name, number of columns) over the columns; notes: footnotes, numbered from 1; head: over the rows' names."""
 
     caption: str
     columns: list[str]
     groups: list[tuple[str, int]] = field(default_factory=list)
-    rows: list[tuple[str | None, str, str, list[_Cell]]] = field(default_factory=list)
+    rows: list[_Row] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+    head: str = "contender"
 
     def noted(self, text: str, reason: str | None) -> _Cell:
         """The text with a footnote where there is a reason; equal reasons share one."""
@@ -88,30 +104,6 @@ class _Table:
     def missing(self, reason: str | None) -> _Cell:
         """An en dash."""
         return self.noted(_DASH, reason)
-
-
-# Numbers --------------------------------------------------------------------------------------------------------------------
-
-
-def number(value: float) -> str:
-    """Two significant digits, scientific outside 0.01..9999: 1.2e-4, 0.33, 17, 1200."""
-    if value == 0:
-        return "0"
-    if not math.isfinite(value):
-        return "∞" if value > 0 else _DASH
-    if 0.01 <= abs(value) < 9999.5:
-        rounded = float(f"{value:.2g}")
-        return f"{rounded:.0f}" if abs(rounded) >= 10 else f"{rounded:.2g}"
-    mantissa, exponent = f"{value:.1e}".split("e")
-    return f"{mantissa}e{int(exponent)}"
-
-
-def duration(seconds: float) -> str:
-    """A time with its unit: 0.84 ms, 1.2 s, 7.5 min, 3.1 h."""
-    for limit, unit, name in ((1e-3, 1e-6, "µs"), (1.0, 1e-3, "ms"), (120.0, 1.0, "s"), (7200.0, 60.0, "min")):
-        if seconds < limit:
-            return f"{seconds / unit:.3g} {name}"
-    return f"{seconds / 3600:.3g} h"
 
 
 def _share(value: float) -> str:
@@ -217,7 +209,7 @@ def _contenders(rows: Sequence[dict]) -> _Table:
         cells += _time_cells(table, row)
         failures = row.get("failures")
         cells.append(table.missing(None) if failures is None else table.noted(f"{failures} of {row['runs']}" if failures else "0", failed))
-        table.rows.append((heading, row["contender"], "Pareto front" if any(row is one for one in front) else "", cells))
+        table.rows.append(_Row(row["contender"], cells, heading, "Pareto front" if any(row is one for one in front) else ""))
     return table
 
 
@@ -278,7 +270,7 @@ def _speed_ups(entries: Sequence[dict]) -> _Table:
             _rollouts(entry["break_even_reference"], table, unpaid),
         ]
         worse = entry["worse_than_trivial"]
-        table.rows.append((None, entry["contender"], f"worse than {', '.join(worse)}" if worse else "", cells))
+        table.rows.append(_Row(entry["contender"], cells, tag=f"worse than {', '.join(worse)}" if worse else ""))
     return table
 
 
@@ -291,7 +283,7 @@ def _floors(rows: Sequence[dict]) -> _Table | None:
     for heading, row in _with_headings([row for row in rows if row["kind"] in ("solver", "learned", "trivial")]):
         over = over_floor(rows, row)
         cells = [_Cell(f"{number(over[at])}×") if over.get(at) is not None else table.missing(None) for at in horizons]
-        table.rows.append((heading, row["contender"], "", cells))
+        table.rows.append(_Row(row["contender"], cells, heading))
     return table
 
 
@@ -310,92 +302,180 @@ def _costs(rows: Sequence[dict]) -> _Table | None:
             if isinstance(value, int | float) and key.endswith("seconds"):
                 cells.append(_Cell(duration(value)))
             else:
-                cells.append(table.missing(None) if value is None else _Cell(_plain_text(value)))
-        table.rows.append((None, row["contender"], "", cells))
+                cells.append(table.missing(None) if value is None else _Cell(words(value)))
+        table.rows.append(_Row(row["contender"], cells))
     return table
 
 
-# Page -----------------------------------------------------------------------------------------------------------------------
+# Over the scenes ------------------------------------------------------------------------------------------------------------
 
 
-def _plain_text(value: object) -> str:
-    """A JSON value for reading: lists by commas, mappings as "key value"."""
-    if value is None:
-        return _DASH
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if isinstance(value, Mapping):
-        return ", ".join(f"{key} {_plain_text(inner)}" for key, inner in value.items()) or _DASH
-    if isinstance(value, list | tuple):
-        return ", ".join(_plain_text(inner) for inner in value) or _DASH
-    return str(value)
+def _glance(scenes: Sequence[dict], folder: str) -> _Table:
+    """One row a scene: its best learned model beside the best trivial baseline and the solver."""
+    columns = ["best learned", "its error", "best trivial", "per frame", "at equal error", "against", "over the reference", "break-even, rollouts"]
+    table = _Table(f"At a glance; error: {MOVING_MSE}", columns, [("accuracy", 3), ("run time", 1), ("speed-up", 3), ("", 1)], head="scene")
+    for scene in scenes:
+        rows, entries, link = scene["rows"], scene["analysis"], f"{folder}/{scene['slug']}.html"
+        tag = f"truth: {rows[0]['reference']}"
+        best = best_learned(entries)
+        if best is None:
+            reason = "none finished every rollout" if entries else "no learned model was compared"
+            table.rows.append(_Row(scene["name"], [table.missing(reason), *[_Cell(_DASH)] * (len(columns) - 1)], tag=tag, link=link))
+            continue
+        trivial = [error for row in rows if row["kind"] == "trivial" and (error := MOVING_MSE.of(row)) is not None]
+        speed = next(row.cells for row in _speed_ups([best]).rows)
+        cells = [
+            _Cell(best["contender"]), _Cell(number(best["error"])), _Cell(number(min(trivial))) if trivial else table.missing("none compared"),
+            _Cell(duration(best["seconds_per_frame"])), speed[1], speed[2],
+            table.missing("reference not timed") if best["speed_up_paper"] is None else speed[0],
+            table.missing("what data and training cost is unknown, or nothing is saved") if speed[7].text == _DASH else speed[7],
+        ]
+        table.rows.append(_Row(scene["name"], cells, tag=tag, link=link))
+    return table
 
 
-def _uri(path: Path) -> str:
-    """The file as a data URI; ``InputError`` where it is missing or of an unknown kind."""
-    path = Path(path)
-    if path.suffix.lower() not in _MEDIA:
-        raise InputError(path, "suffix", path.suffix, f"a report embeds {', '.join(_MEDIA)}")
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(path, "file", error.strerror, "make the picture first or leave it out") from None
-    return f"data:{_MEDIA[path.suffix.lower()]};base64,{base64.b64encode(data).decode()}"
+def _published(scenes: Sequence[dict]) -> _Table | None:
+    """Learned models on scenes that reproduce a domain of the paper, beside its Table 1; None where there are none."""
+    columns = ["one step", "all frames", "ours / paper", "model", "parameters", "trajectories", "steps", "took", "particles", "frames"]
+    table = _Table(
+        "Beside Table 1 of Sanchez-Gonzalez et al. (2020), whose figures are in small print", columns,
+        [("MSE, all particles", 3), ("network", 2), ("training", 3), ("test", 2)],
+    )
+    for scene in scenes:
+        rows, name = scene["rows"], reproduced(scene["rows"][0]["scene"])
+        if name is None:
+            continue
+        domain, variant = DOMAINS[name], scene["name"].removeprefix(name).lstrip("-, ")
+        heading = name.upper().replace("_", "-") + (f", {variant}" if variant else "")
+        parameters = PARAMETERS[domain.dim]
+        for row in (row for row in rows if row["kind"] == "learned"):
+            cost, failed = row.get("cost") or {}, _failure(row)
+            one_step, rollout = row["one_step_mse"], row["rollout_mse"]["all"]
+            particles = [run["particles"] for run in row["spread"]["per_trajectory"] if "particles" in run]
+
+            def beside(value: float | None, paper: float, text: str | None = None, table: _Table = table) -> _Cell:
+                shown = _DASH if value is None else text or f"{round(value):,}"
+                return _Cell(shown, f"{paper:,}")
+
+            cells = [
+                _Cell(number(one_step), number(domain.one_step_mse)) if one_step is not None else table.missing(failed),
+                _Cell(number(rollout), number(domain.rollout_mse)) if rollout is not None else table.missing(failed),
+                _Cell(f"{number(rollout / domain.rollout_mse)}×") if rollout is not None else table.missing(failed),
+                _Cell(words(row.get("settings", {}).get("model")).replace("_", " "), "gns"), beside(cost.get("parameters"), parameters),
+                beside(cost.get("trajectories"), domain.trajectories), beside(cost.get("steps"), TRAINING_STEPS),
+                _Cell(duration(cost["training_seconds"]), words(cost.get("device"))) if cost else table.missing("not said beside the checkpoint"),
+                beside(sum(particles) / len(particles) if particles else None, domain.particles), beside(row["frames"], domain.steps),
+            ]
+            table.rows.append(_Row(row["contender"], cells, heading))
+            heading = None
+    return table if table.rows else None
+
+
+def _all_costs(rows: Sequence[dict]) -> _Table | None:
+    """``_costs`` of every learned model once, on however many scenes it was compared."""
+    seen: dict[str, dict] = {}
+    for row in rows:
+        if row.get("cost"):
+            seen.setdefault(json.dumps([row["contender"], row["cost"]], sort_keys=True), row)
+    return _costs(list(seen.values()))
+
+
+def _jobs(jobs: Sequence[Mapping]) -> _Table:
+    """What making the results took, a row a step of the workflow."""
+    columns = ["jobs", "time, all", "longest", "memory, most"]
+    table = _Table("The workflow's steps, as they last ran; several at a time where there are cores", columns, head="step")
+    for job in jobs:
+        memory = table.missing("too short to be looked at") if job["memory_mb"] is None else _Cell(f"{number(job['memory_mb'])} MB")
+        cells = [_Cell(str(job["jobs"])), _Cell(duration(job["seconds"])), _Cell(duration(job["longest_seconds"])), memory]
+        table.rows.append(_Row(job["rule"].replace("_", " "), cells))
+    everything = sum(job["seconds"] for job in jobs)
+    table.rows.append(_Row("all", [_Cell(str(sum(job["jobs"] for job in jobs))), _Cell(duration(everything)), _Cell(""), _Cell("")]))
+    return table
+
+
+# Pages ----------------------------------------------------------------------------------------------------------------------
 
 
 def _embed(assets: Iterable[Asset]) -> list[_Media]:
-    return [
-        _Media(_uri(asset.path), Path(asset.path).suffix.lower() == ".mp4", asset.caption, _uri(asset.poster) if asset.poster else None)
-        for asset in assets
-    ]
+    result = []
+    for asset in assets:
+        kind = {".mp4": "film", ".svg": "chart"}.get(Path(asset.path).suffix.lower(), "still")
+        result.append(_Media(file_uri(asset.path), kind, asset.caption, file_uri(asset.poster) if asset.poster else None, asset.wide))
+    return result
 
 
-def _sections(rows: Sequence[dict], analysis: Sequence[dict], assets: Mapping[str, SceneAssets]) -> list[dict]:
-    """One section per scene and reference, in the order of the rows; a scene's pictures go with its first section."""
-    groups: dict[tuple[str, str | None], list[dict]] = {}
-    for row in rows:
-        groups.setdefault((row["scene"], row.get("reference")), []).append(row)
-    sections, shown = [], set()
+def _scenes(rows: Sequence[dict], analysis: Sequence[dict]) -> list[dict]:
+    """The pages' names, rows and analyses, one per scene and reference, in the order of the rows."""
+    groups, entries = by_scene(rows), by_scene(analysis)
+    scenes = [scene for scene, _ in groups]
+    result = []
     for (scene, reference), members in groups.items():
-        media = assets.get(scene, SceneAssets()) if scene not in shown else SceneAssets()
-        shown.add(scene)
-        entries = [entry for entry in analysis if entry["scene"] == scene and entry.get("reference") == reference]
-        first = members[0]
-        tables = [_contenders(members), _speed_ups(entries) if entries else None, _floors(members), _costs(members)]
-        facts = [
-            f"truth: {reference}" if reference else "", f"{first['trajectories']} test trajectories" if first.get("trajectories") else "",
-            f"{first['frames']} predicted frames of {duration(first['frame_step'])}" if first.get("frames") and first.get("frame_step") else "",
-            f"{first['known_frames']} known frames" if first.get("known_frames") else "",
-        ]
-        sections.append({
-            "scene": scene, "facts": ", ".join(fact for fact in facts if fact),
-            "moving": _embed([*media.films, *media.stills]), "figures": _embed(media.figures), "training": _embed(media.training),
-            "tables": [table for table in tables if table],
-            "settings": [(row["contender"], json.dumps(row.get("settings", {}), sort_keys=True)) for row in _by_kind(members)],
+        alone = scenes.count(scene) == 1
+        result.append({
+            "name": scene if alone else f"{scene}, truth: {reference}", "slug": scene if alone else f"{scene}-{reference}".replace(" ", "-"),
+            "rows": members, "analysis": entries.get((scene, reference), []),
         })
-    return sections
+    return result
 
 
-def write_report(summary: Mapping, path: str | Path, assets: Mapping[str, SceneAssets] | None = None) -> None:
-    """Write the page, complete or not at all.
+def _page(scene: Mapping, media: SceneAssets) -> dict:
+    """All that the templates show of a scene."""
+    rows, entries = scene["rows"], scene["analysis"]
+    first = rows[0]
+    facts = [
+        f"truth: {first['reference']}", f"{first['trajectories']} test trajectories" if first.get("trajectories") else "",
+        f"{first['frames']} predicted frames of {duration(first['frame_step'])}" if first.get("frames") and first.get("frame_step") else "",
+        f"{first['known_frames']} known frames" if first.get("known_frames") else "",
+    ]
+    tables = [_contenders(rows), _speed_ups(entries) if entries else None, _floors(rows), _costs(rows)]
+    main, films = _embed(media.main), _embed(media.films)
+    still = [_Media(film.poster, "still", f"{film.caption} Half way.", None, False) for film in films[:1] if film.poster]
+    holds = ["films" if films else "", "curves over time" if media.figures else "", "trainings" if media.training else "", "settings"]
+    return {
+        "name": scene["name"], "slug": scene["slug"], "facts": ", ".join(fact for fact in facts if fact), "verdict": scene_verdict(rows),
+        "main": [*still, *main], "moving": [*films, *_embed(media.stills)], "figures": [*main, *_embed(media.figures)],
+        "training": _embed(media.training), "tables": [table for table in tables if table], "holds": ", ".join(part for part in holds if part),
+        "settings": [(row["contender"], json.dumps(row.get("settings", {}), sort_keys=True)) for row in _by_kind(rows)],
+    }
+
+
+def write_report(
+    summary: Mapping, path: str | Path, assets: Mapping[str, SceneAssets] | None = None, overview: Sequence[Asset] = (),
+) -> None:
+    """Write the entry to ``path`` (NAME.html), last, and a page for every scene and reference to the folder NAME beside it, which is replaced.
 
     summary: as in ``learn.compare`` with "rows", "verdict" (the first paragraph), "hardware", "versions"; optional "title", "analysis" (by
-    ``analyse``; made from the rows if absent) and "provenance" (name -> text, list or mapping: commands, seeds, revision, ...).
-    assets: scene -> its pictures. ``InputError`` for a summary without rows or verdict, and for pictures that cannot be read.
+    ``analyse``; made from the rows if absent), "jobs" (what the workflow's steps took: rule, jobs, seconds, longest_seconds, memory_mb) and
+    "provenance" (name -> text, list or mapping: commands, seeds, revision, ...). assets: scene -> its pictures, which go with its first page;
+    overview: pictures of all scenes together, for the entry. ``InputError``, and nothing written, for a summary without rows or verdict and for
+    pictures that cannot be read; ``OSError``.
     """
-    rows = summary.get("rows")
+    path, rows = Path(path), summary.get("rows")
     if not rows:
         raise InputError(path, "summary.rows", rows, "a report needs at least one row; run the comparison first")
     if not summary.get("verdict"):
         raise InputError(path, "summary.verdict", summary.get("verdict"), "a report begins with its verdict; make it by learn.compare.verdict")
-    analysis = summary["analysis"] if "analysis" in summary else analyse(rows)
-    provenance = {name: summary.get(name) or {} for name in ("hardware", "versions")}
-    loader = jinja2.FileSystemLoader(Path(__file__).parent)
-    environment = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    page = environment.get_template("report_template.html").render(
-        title=summary.get("title", "Learned simulators against their teacher"), verdict=summary["verdict"],
-        sections=_sections(rows, analysis, assets or {}), text=_plain_text,
-        provenance={name: content for name, content in [*provenance.items(), *(summary.get("provenance") or {}).items()] if content},
+    title, folder = summary.get("title", "Learned simulators against their teacher"), path.with_suffix("")
+    scenes = _scenes(rows, summary["analysis"] if "analysis" in summary else analyse(rows))
+    left = dict(assets or {})
+    pages = [_page(scene, left.pop(scene["rows"][0]["scene"], SceneAssets())) for scene in scenes]
+    hardware = summary.get("hardware") or {}
+    provenance = {name: summary.get(name) or {} for name in ("hardware", "versions")} | (summary.get("provenance") or {})
+    here = Path(__file__).parent
+    entry = render(
+        here / "report_template.html", title=title, verdict=summary["verdict"], folder=folder.name, pages=pages, overview=_embed(overview),
+        glance=_glance(scenes, folder.name), published=_published(scenes), costs=_all_costs(rows),
+        jobs=_jobs(summary["jobs"]) if summary.get("jobs") else None, provenance={name: content for name, content in provenance.items() if content},
     )
+    machine = ", ".join(words(hardware[key]) for key in ("cpu", "gpu") if hardware.get(key)) or "an unknown machine"
+    with atomic_folder(folder) as temporary:
+        for page in pages:
+            text = render(
+                here / "scene_template.html", title=f"{page['name']}: {title}", study=title, entry=path.name, page=page, pages=pages, machine=machine,
+                provenance={},
+            )
+            (temporary / f"{page['slug']}.html").write_bytes(text)
+        if folder.is_dir():
+            shutil.rmtree(folder)
     with atomic_path(path) as temporary:
-        temporary.write_bytes(page.encode())
+        temporary.write_bytes(entry)

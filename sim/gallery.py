@@ -9,9 +9,9 @@ from pathlib import Path
 
 from PIL import Image
 
+from sim.domains import DOMAINS
 from sim.errors import InputError
 from sim.generate import scene_teacher, simulate, trajectory_seed
-from sim.paper import DOMAINS
 from sim.render import render_strip
 from sim.scene import SceneFamily
 from sim.trajectory import Trajectory, atomic_path

@@ -117,7 +117,10 @@ def vacant(path: str | Path) -> Path:
 
 @contextmanager
 def atomic_folder(path: Path) -> Iterator[Path]:
-    """Yield a temporary folder beside ``path``; on success flush its files and rename it, on any error remove it. Complete or absent."""
+    """Yield a temporary folder beside ``path``; on success flush its files and rename it, on any error remove it. Complete or absent.
+
+    A write in it that fails is an ``OSError`` that names ``path``, as by ``atomic_path``.
+    """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         temporary.mkdir(parents=True)
@@ -129,6 +132,10 @@ def atomic_folder(path: Path) -> Iterator[Path]:
             if file.is_file():
                 flush(file)
         os.replace(temporary, path)
+    except OSError as error:
+        if error.errno is not None and (error.filename is None or Path(error.filename).is_relative_to(temporary)):
+            error.filename, error.filename2 = str(path), None
+        raise
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import subprocess
 from pathlib import Path
@@ -10,7 +11,8 @@ import numpy as np
 
 from learn.compare import PARTICLES, SCENE, Target, Yardstick, analyse, verdict
 from learn.generalisation import groups, trials
-from learn.report import Asset, SceneAssets, number
+from learn.report import Asset, SceneAssets
+from learn.units import number
 from sim.scene import SceneFamily
 from workflow.rows import timed_rows
 from workflow.study import PARTS, Study
@@ -82,6 +84,23 @@ def _provenance(study: Study) -> dict:
     return {"how to repeat": how_to_repeat(study), "data": data, "models": study.models}
 
 
+def jobs(study: Study) -> list[dict]:
+    """What the steps of the workflow took when they last ran, by Snakemake's benchmarks; the longest first."""
+    found: dict[str, list[dict]] = {}
+    known = {*study.data, *study.models, *study.comparisons}
+    files = [path for path in study.folder.glob("benchmarks/*/*.tsv") if any(path.stem == name or path.stem.startswith(f"{name}-") for name in known)]
+    for path in files:
+        with path.open(newline="") as file:
+            found.setdefault(path.parent.name, []).extend(csv.DictReader(file, delimiter="\t"))
+    result = []
+    for rule, lines in found.items():
+        seconds, memory = [float(line["s"]) for line in lines], [float(line["max_rss"]) for line in lines if line["max_rss"] not in ("-", "NA")]
+        result.append({
+            "rule": rule, "jobs": len(lines), "seconds": sum(seconds), "longest_seconds": max(seconds), "memory_mb": max(memory, default=None),
+        })
+    return sorted(result, key=lambda job: -job["seconds"])
+
+
 def summarise(study: Study) -> dict:
     """The content of ``summary.json``: rows, hardware, versions, and what follows from the rows."""
     rows, targets, machines, versions = [], [], {}, {}
@@ -100,7 +119,7 @@ def summarise(study: Study) -> dict:
         provenance["timed on"] = machines
     return {
         "title": study.content["title"], "rows": rows, "hardware": hardware, "versions": versions, "analysis": analyse(rows),
-        "verdict": verdict(rows, targets), "provenance": provenance,
+        "verdict": verdict(rows, targets), "jobs": jobs(study), "provenance": provenance,
     }
 
 
@@ -119,6 +138,12 @@ def _generalisation(study: Study, comparison: str, summary: dict) -> str:
     return f"Beyond the training. Median MSE of the rollout, and as a multiple of the best trivial baseline's. {' '.join(said)}"
 
 
+def overview(study: Study) -> list[Asset]:
+    """Pictures of all scenes together."""
+    caption = "Each learned model's speed-up at equal error, filled, and over the reference, as papers usually count it, hollow."
+    return [Asset(path, caption) for path in study.overview]
+
+
 def assets(study: Study, summary: dict) -> dict[str, SceneAssets]:
     """Scene -> its pictures, as the rules made them."""
     result = {}
@@ -128,6 +153,7 @@ def assets(study: Study, summary: dict) -> dict[str, SceneAssets]:
         def picture(name: str, comparison: str = comparison) -> Path:
             return study.picture(comparison, name)
 
+        ablations = "Ablations: each training a dot, their median a line."
         count = next(row["trajectories"] for row in summary["rows"] if row["scene"] == scene)
         films = [
             Asset(
@@ -138,11 +164,13 @@ def assets(study: Study, summary: dict) -> dict[str, SceneAssets]:
         ]
         result[scene] = SceneAssets(
             films=films,
-            stills=[Asset(picture("strip.png"), "The same trajectory at six moments: teacher above, learned below.")] if films else [],
-            figures=[
-                *([Asset(picture("ablation.svg"), "Ablations: each training a dot, their median a line.")] if entry["axes"] else []),
+            stills=[Asset(picture("strip.png"), "The same trajectory at six moments: teacher above, learned below.", wide=True)] if films else [],
+            main=[
+                *([Asset(picture("ablation.svg"), ablations, wide=len(entry["axes"]) > 3)] if entry["axes"] else []),
                 *([Asset(picture("generalisation.svg"), _generalisation(study, comparison, summary))] if "generalisation" in entry else []),
                 Asset(picture("error_over_run_time.svg"), "Error over run time, one thread each, the same machine."),
+            ],
+            figures=[
                 Asset(picture("error_over_time.svg"), "Error over time, with the chaos floor."),
                 Asset(picture("kinetic_energy.svg"), "Kinetic energy over time."),
             ],

@@ -58,6 +58,11 @@ def digest(*parts: object) -> str:
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
 
 
+def _texts(*patterns: str) -> list[str]:
+    """What templates and style sheets hold."""
+    return [path.read_text() for pattern in patterns for path in sorted(ROOT.glob(pattern)) if path.suffix != ".py"]
+
+
 @dataclass(frozen=True)
 class Study:
     """A validated study: its content with defaults filled in, and where each of its results lives."""
@@ -131,6 +136,11 @@ class Study:
         names += [f"{figure}.svg" for figure in FIGURES] + ["training.svg"] * bool(self.training_runs(comparison))
         return [self.picture(comparison, name) for name in names]
 
+    @property
+    def overview(self) -> list[Path]:
+        """What a report shows of all comparisons together."""
+        return [self.folder / "pictures" / "speed_ups.svg"] * any(entry["learned"] for entry in self.comparisons.values())
+
     def generalised(self, comparison: str) -> list[str]:
         """The comparisons whose trajectories its figure of generalisation draws, its own first."""
         return [comparison, *self.comparisons[comparison]["generalisation"].get("with", [])]
@@ -187,7 +197,7 @@ class Study:
     def report_recipe(self) -> str:
         """Hash of what the report says beyond its input files: title, targets, settings, and its code and template."""
         sections = {section: {name: entry | {"resources": None} for name, entry in self.content[section].items()} for section in ("data", "models")}
-        return digest(self.content | sections, code_hash("workflow.scripts.summary"), (ROOT / "learn" / "report_template.html").read_text())
+        return digest(self.content | sections, code_hash("workflow.scripts.summary"), _texts("sim/page.*", "learn/*.html"))
 
     def stress_recipe(self, job: str) -> str:
         """Hash of the code that the cases of a job run."""
@@ -195,9 +205,8 @@ class Study:
 
     def stability_recipe(self) -> str:
         """Hash of what a stability report says beyond its input files."""
-        template = (ROOT / "sim" / "stability" / "report_template.html").read_text()
         titles = [f"sim.stability.{case}" for cases in self.stability.values() for case in cases]
-        return digest(self.content, code_hash("workflow.scripts.stability_report", *titles), template)
+        return digest(self.content, code_hash("workflow.scripts.stability_report", *titles), _texts("sim/page.*", "sim/stability/*.html"))
 
     def budget(self, model: str) -> dict[str, float]:
         return {key: self.models[model][key] for key in ("minutes", "steps") if key in self.models[model]}

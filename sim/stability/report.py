@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import base64
 import importlib
 import io
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from itertools import groupby
 from pathlib import Path
 
-import jinja2
 import numpy as np
 
+from sim.page import data_uri, render
 from sim.stability import BOUND, Cell
 from sim.trajectory import atomic_path
 
@@ -71,16 +71,21 @@ def verdict(rows: Sequence[Mapping]) -> str:
     if wrong:
         named = [f"{one['case'].replace('_', ' ')}, {one['cell']} ({one['observed']})" for one in wrong]
         text += f" Wrong: {'; '.join(named)}."
-    for case in MAPS:
-        cells = [one for one in rows if one["case"] == case]
-        accepted = [one["numbers"]["outcome"] for one in cells if one["numbers"].get("refused") is False]
-        if cells:
-            text += (
-                f" {title(case).split(':')[0]}: {len(accepted)} fixed steps were accepted, of which {accepted.count('grew')} gained energy unnoticed "
-                f"and {accepted.count('not finite')} failed and said so; of those refused, run all the same, the first to go wrong was "
-                f"{onset(cells):.2g} times the limit."
-            )
+    maps = [cells for case in MAPS if (cells := [one for one in rows if one["case"] == case])]
+    if maps:
+        accepted = sum((accepted_steps(cells) for cells in maps), Counter())
+        first = sorted({f"{onset(cells):.2g}" for cells in maps}, key=float)
+        text += (
+            f" Of {accepted.total()} fixed time steps that were accepted on {len(maps)} map{'s' if len(maps) > 1 else ''}, {accepted['grew']} gained "
+            f"energy unnoticed and {accepted['not finite']} failed and said so; of those refused, run all the same, the first to go wrong was "
+            f"{' to '.join(dict.fromkeys((first[0], first[-1])))} times the limit."
+        )
     return text
+
+
+def accepted_steps(rows: Sequence[Mapping]) -> Counter[str]:
+    """Outcome -> how many fixed steps of a map that were accepted came to it."""
+    return Counter(one["numbers"]["outcome"] for one in rows if one["numbers"].get("refused") is False)
 
 
 def map_figure(rows: Sequence[Mapping], case: str):
@@ -134,7 +139,7 @@ def curve_figure(rows: Sequence[Mapping]):
 def _uri(figure) -> str:
     data = io.BytesIO()
     figure.savefig(data, format="svg")
-    return f"data:image/svg+xml;base64,{base64.b64encode(data.getvalue()).decode()}"
+    return data_uri(data.getvalue(), ".svg")
 
 
 def _shown(numbers: Mapping) -> str:
@@ -149,19 +154,23 @@ def write_report(summary: Mapping, path: str | Path) -> None:
     for case, members in groupby(summary["rows"], key=lambda one: one["case"]):
         rows, pictures = list(members), []
         if case in MAPS:
-            pictures.append((_uri(map_figure(rows, case)), "Each mark is a run at a fixed time step. What is refused was run all the same."))
+            accepted = accepted_steps(rows)
+            told = (
+                f"Each mark is a run at a fixed time step. {accepted.total()} were accepted, of which {accepted['grew']} gained energy unnoticed and "
+                f"{accepted['not finite']} failed and said so. What is refused was run all the same: the first to go wrong was {onset(rows):.2g} "
+                "times the limit."
+            )
+            pictures.append((_uri(map_figure(rows, case)), told))
         if any(one["curves"] for one in rows):
             pictures.append((_uri(curve_figure(rows)), "Kinetic, potential and elastic energy, over what there is to release; 1 at the start."))
         wrong = sum(not one["right"] for one in rows)
         # The cells of a map are told by its picture; the table holds those that went wrong and the adaptive runs.
         listed = [one for one in rows if not one["right"] or "courant" not in one["numbers"]] if case in MAPS else rows
-        sections.append({"title": title(case), "rows": listed, "pictures": pictures, "cells": len(rows), "wrong": wrong,
+        sections.append({"case": case, "title": title(case), "rows": listed, "pictures": pictures, "cells": len(rows), "wrong": wrong,
                          "seconds": sum(one["seconds"] for one in rows)})  # fmt: skip
-    loader = jinja2.FileSystemLoader(Path(__file__).parent)
-    environment = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    page = environment.get_template("report_template.html").render(
-        title=summary["title"], verdict=summary["verdict"], sections=sections, shown=_shown,
-        provenance={name: summary[name] for name in ("hardware", "versions", "provenance")},
+    page = render(
+        Path(__file__).parent / "report_template.html", title=summary["title"], verdict=summary["verdict"], sections=sections, shown=_shown,
+        provenance={name: summary[name] for name in ("hardware", "versions")} | {"how to repeat": summary["provenance"]},
     )
     with atomic_path(path) as temporary:
-        temporary.write_bytes(page.encode())
+        temporary.write_bytes(page)

@@ -334,7 +334,32 @@ def test_references_and_scenes_are_kept_apart():
     model = row("gns", "learned", 1e-3, 8.0, reference="fine teacher")
     elsewhere = row("rung", "solver", 1e-9, 0.1, scene="water", reference="fine teacher")
     assert c.speed_up_at_equal_error([*LADDER, elsewhere, model], model)["outcome"] == "no rung"
-    assert c.verdict([*LADDER, elsewhere, model]).count("On ") == 3
+    text = c.verdict([*LADDER, elsewhere, model])
+    assert text.startswith("No learned model wins at equal error (rollout MSE of moving particles over all frames) on any of the 3 scenes. On sand (")
+    assert "On sand (truth: fine teacher) no solver rung that was timed is as accurate." in text
+    assert "On sand (truth: teacher) and water no learned model was compared." in text
+
+
+def elsewhere(scene, *rows):
+    return [row | {"scene": scene} for row in (*LADDER, *TRIVIAL, *rows)]
+
+
+def test_the_verdict_on_several_scenes_counts():
+    loses = elsewhere("sand", row("gns", "learned", 1e-3, 8.0)) + elsewhere("goop", row("grid", "learned", 1e-3, 2.0))
+    text = c.verdict(loses)
+    assert text.startswith("No learned model wins at equal error (rollout MSE of moving particles over all frames) on any of the 2 scenes.")
+    assert text.endswith("On 2 the best loses to the solver, by the least on goop, where grid takes 2 times as long.")
+    more = (
+        elsewhere("water", row("gns", "learned", 5e-5, 0.8)) + elsewhere("snow", row("gns", "learned", 0.5, 0.1))
+        + elsewhere("jelly", row("gns", "learned", None, 0.1, failures=10)) + elsewhere("mud", row("gns", "learned", 1e-3, 0.9, spread=0.2))
+    )
+    missed = c.Target("snow", "gns", c.MOVING_MSE, high=0.1)
+    text = c.verdict(loses + more, [missed])
+    assert text.startswith(
+        "At equal error (rollout MSE of moving particles over all frames) a learned model wins on 1 of 6 scenes: gns on water, 5 times faster than "
+        "the solver. On 2 the solver is faster, by the least on goop, where grid takes 2 times as long. On mud the best ties with the solver"
+    )
+    assert "On snow the best is worse than a trivial baseline. On jelly none finished every rollout. Missed: gns on snow" in text
 
 
 def test_other_yardsticks():

@@ -127,6 +127,27 @@ def test_a_chaos_floor_below_the_axis_is_said(tmp_path, kept):
     assert kept[0].axes[0].get_ylim()[0] > 1e-9
 
 
+def test_speed_ups_show_every_learned_model_both_ways(tmp_path, kept):
+    def entry(scene, name, outcome, ratio, paper):
+        return {"scene": scene, "contender": name, "equal_error": {"outcome": outcome, "ratio": ratio}, "speed_up_paper": paper}
+
+    analysis = [
+        entry("sand", "gns", "loses", 0.1, 2.0), entry("sand", "grid", "wins", 3.0, 9.0), entry("mud", "gns", "worse than trivial", 5.0, 6.0),
+        entry("mud", "dead", "failed", None, 7.0), entry("mud", "alone", "no rung", None, None),
+    ]
+    figures.speed_ups(analysis, tmp_path / "figure.svg")
+    (axes,) = kept[0].axes
+    marks = {(line.get_marker(), *line.get_xdata(), *line.get_ydata()) for line in axes.lines if len(line.get_xdata()) == 1}
+    assert {("v", 0.1, 0), ("s", 3.0, 1), ("X", 5.0, 2), *(("o", paper, place) for place, paper in enumerate((2.0, 9.0, 6.0, 7.0)))} == marks
+    assert [(text.get_text(), text.get_position()[1]) for text in axes.texts] == [("failed", 3), ("no rung", 4)]
+    assert [label.get_text() for label in axes.get_yticklabels()] == ["sand: gns", "sand: grid", "mud: gns", "mud: dead", "mud: alone"]
+    low, high = axes.get_xlim()
+    assert low < 0.1 and high > 9 and axes.get_ylim() == (4.6, -0.6)
+    assert [text.get_text() for text in kept[0].legends[0].get_texts()] == [
+        "at equal error: wins", "at equal error: loses", "at equal error: worse than trivial", "over the reference, accuracy aside",
+    ]
+
+
 def test_curves_show_every_contender(tmp_path, kept):
     figures.error_over_time(ROWS, tmp_path / "error.svg")
     figures.kinetic_energy(ROWS, tmp_path / "energy.svg")

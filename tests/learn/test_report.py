@@ -1,4 +1,4 @@
-"""The report: self-contained, complete, and without a figure that the summary does not hold."""
+"""The report: pages that are self-contained and complete, linked both ways, without a figure that the summary does not hold."""
 
 import base64
 import json
@@ -68,7 +68,8 @@ def assets(tmp_path):
     return {
         "hand": report.SceneAssets(
             films=[asset(tmp_path / "film.mp4", "solver, model, error", tmp_path / "poster.png")], stills=[asset(tmp_path / "poster.png", "the end")],
-            figures=[asset(tmp_path / "figure.svg", 'error "over" <time>')], training=[asset(tmp_path / "curve.png", "loss")],
+            main=[asset(tmp_path / "figure.svg", 'error "over" <run time>')], figures=[asset(tmp_path / "figure.svg", "over time", wide=True)],
+            training=[asset(tmp_path / "curve.png", "loss")],
         )
     }
 
@@ -116,31 +117,107 @@ class Page(HTMLParser):
         return {row[0].split(" | ")[0]: row for row in found}
 
 
-def write(tmp_path, rows, assets=None, **more):
+def write(tmp_path, rows, assets=None, page="hand", overview=(), **more):
+    """Text and tags of a scene's page, or of the entry (None)."""
     summary = compare.summary(rows) | {"verdict": VERDICT} | more
     json.dumps(summary, allow_nan=False)
-    report.write_report(summary, tmp_path / "report.html", assets)
-    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    report.write_report(summary, tmp_path / "report.html", assets, overview)
+    text = (tmp_path / ("report.html" if page is None else f"report/{page}.html")).read_text(encoding="utf-8")
     return text, Page(text)
 
 
-def test_page_is_self_contained_and_begins_with_the_verdict(tmp_path, rows, assets):
-    provenance = {"commands": ["make demo"], "seeds": {"train": [1, 2]}, "revision": "abc1"}
-    text, page = write(tmp_path, rows, assets, title="Sand & water", provenance=provenance)
-    assert page.paragraphs[0] == VERDICT
+def check_self_contained(text, page, count):
+    """No script, no network, every picture inside the page; links lead to pages of the report alone."""
     names = [tag for tag, _ in page.tags]
     assert "script" not in names and "link" not in names and "iframe" not in names
     media = [attributes for tag, attributes in page.tags if tag in ("img", "video")]
-    assert len(media) == 4 and all(attributes["src"].startswith("data:") for attributes in media)
+    assert len(media) == count and all(attributes["src"].startswith("data:") for attributes in media)
+    assert "http:" not in text and "https:" not in text and "url(" not in text and "@import" not in text
+    assert any(attributes.get("name") == "viewport" for _, attributes in page.tags)
+    return media
+
+
+def test_the_entry_stands_alone_and_begins_with_the_verdict(tmp_path, rows, assets):
+    provenance = {"commands": ["make demo"], "seeds": {"train": [1, 2]}, "revision": "abc1"}
+    overview = [report.Asset(tmp_path / "figure.svg", "speed-ups")]
+    text, page = write(tmp_path, rows, assets, None, overview, title="Sand & water", provenance=provenance)
+    assert page.paragraphs[0] == VERDICT
+    first, still, main = check_self_contained(text, page, 3)
+    assert first["alt"] == "speed-ups"
+    assert still["src"].startswith("data:image/png") and still["alt"] == "solver, model, error Half way."
+    assert main["src"].startswith("data:image/svg+xml") and main["alt"] == 'error "over" <run time>'
+    for expected in ("Sand &amp; water", "make demo", "<dt>train</dt><dd>1, 2</dd>", "abc1", "numpy", "10 predicted frames of 10 ms"):
+        assert expected in text
+    assert page.table("Cost of data and training")["gns"][1:] == ["90 s", "10 min", "100"]
+    assert sorted(entry.name for entry in tmp_path.glob("*.html")) == ["report.html"]
+    assert [entry.name for entry in (tmp_path / "report").iterdir()] == ["hand.html"]
+
+
+def test_the_page_of_a_scene_holds_all_of_it(tmp_path, rows, assets):
+    text, page = write(tmp_path, rows, assets)
+    assert page.paragraphs[0] == compare.scene_verdict(rows)
+    media = check_self_contained(text, page, 5)
     film = next(attributes for tag, attributes in page.tags if tag == "video")
     assert film["src"].startswith("data:video/mp4;base64,") and film["poster"].startswith("data:image/png;base64,")
     assert base64.b64decode(film["src"].split(",")[1]) == PIXEL
-    assert any(attributes["src"].startswith("data:image/svg+xml") and attributes["alt"] == 'error "over" <time>' for attributes in media)
-    assert "http:" not in text and "https:" not in text and "url(" not in text and "@import" not in text
-    assert any(attributes.get("name") == "viewport" for _, attributes in page.tags)
-    for expected in ("Sand &amp; water", "make demo", "<dt>train</dt><dd>1, 2</dd>", "abc1", "numpy", "10 predicted frames of 10 ms"):
-        assert expected in text
-    assert [entry.name for entry in tmp_path.glob("*.html")] == ["report.html"]
+    assert sorted(attributes["alt"] for attributes in media if "alt" in attributes) == ['error "over" <run time>', "loss", "over time", "the end"]
+    assert any(tag == "figure" and attributes["class"] == "chart wide" for tag, attributes in page.tags)
+
+
+def links(page):
+    return [attributes["href"] for tag, attributes in page.tags if tag == "a"]
+
+
+def test_pages_are_linked_both_ways(tmp_path, rows):
+    rows = rows + [row | {"scene": "sand"} for row in rows] + [row | {"reference": "fine teacher"} for row in rows]
+    text, entry = write(tmp_path, rows, page=None)
+    pages = {"hand-teacher", "sand", "hand-fine-teacher"}
+    anchors = {attributes.get("id") for _, attributes in entry.tags}
+    assert set(links(entry)) == {f"report/{page}.html" for page in pages} and pages <= anchors
+    for page in pages:
+        _, other = write(tmp_path, rows, page=page)
+        assert set(links(other)) == {f"../report.html#{page}", "../report.html#provenance", *(f"{each}.html" for each in pages - {page})}
+    assert text.count(compare.scene_verdict(rows[:7])) == 1  # among several scenes each has its verdict in the entry as well
+
+
+def test_pages_of_an_earlier_report_go(tmp_path, rows):
+    write(tmp_path, [row | {"scene": "sand"} for row in rows], page="sand")
+    write(tmp_path, rows)
+    assert [entry.name for entry in (tmp_path / "report").iterdir()] == ["hand.html"]
+
+
+def test_scenes_at_a_glance(tmp_path, rows):
+    failed = [row | {"scene": "mud"} for row in rows if row["contender"] != "gns"]
+    text, page = write(tmp_path, rows + failed, page=None)
+    table = page.table("At a glance; error: rollout MSE of moving particles over all frames")
+    trivial = compare.MOVING_MSE.of(next(row for row in rows if row["contender"] == "frozen"))
+    assert table["hand"] == ["hand | truth: teacher", "gns", "4.0e-4", report.number(trivial), "3 ms", "0.33× | loses", "rung", "3×", "never"]
+    assert table["mud"][1:] == ["–^1", *["–"] * 7] and "none finished every rollout" in text
+    assert "None of these scenes is one of the sixteen domains" in text
+
+
+def test_a_domain_of_the_paper_stands_beside_its_table(tmp_path, rows):
+    stiff = [row | {"scene": "waterdrop-stiff"} for row in rows]
+    box = [row | {"scene": "boxbath", "settings": {"model": "gns"}} for row in rows if row["contender"] != "dead"]
+    text, page = write(tmp_path, rows + stiff + box, page=None)
+    caption = next(caption for caption in page.tables if caption.startswith("Beside Table 1"))
+    (_, _, first, gns, dead, second, box_gns) = page.tables[caption]
+    assert first[0] == "WATERDROP, stiff" and second[0] == "BOXBATH"
+    assert gns[1:4] == ["4.0e-4 | 1.5e-9", "4.0e-4 | 7.0e-3", "0.057×"]
+    assert gns[4:] == ["– | gns", "– | 1,591,826", "100 | 1,000", "– | 20,000,000", "10 min | –", "10 | 1,000", "10 | 1,000"]
+    assert dead[1].startswith("–^") and dead[3].startswith("–^") and dead[8].startswith("–^")
+    assert box_gns[3:6] == ["0.095×", "gns | gns", "– | 1,592,979"] and box_gns[-2:] == ["10 | 1,000", "10 | 150"]
+    assert "multiplied by 100 to 160" in text and "None of these scenes" not in text
+
+
+def test_what_the_steps_took(tmp_path, rows):
+    jobs = [
+        {"rule": "train", "jobs": 2, "seconds": 90.0, "longest_seconds": 60.0, "memory_mb": 512.0},
+        {"rule": "training_curve", "jobs": 1, "seconds": 0.5, "longest_seconds": 0.5, "memory_mb": None},
+    ]
+    _, page = write(tmp_path, rows, page=None, jobs=jobs)
+    table = page.table("The workflow's steps")
+    assert table["train"][1:] == ["2", "90 s", "60 s", "510 MB"] and table["training curve"][-1] == "–^1" and table["all"][1:3] == ["3", "90.5 s"]
 
 
 def test_every_table_scrolls_in_its_own_box(tmp_path, rows):
@@ -207,17 +284,18 @@ def test_analysis_of_the_summary_is_used_as_it_is(tmp_path, rows):
     assert gns[1] == "42×" and gns[0] == "gns | worse than frozen"
 
 
-def test_one_section_per_scene_and_reference(tmp_path, rows, assets):
+def test_one_page_per_scene_and_reference(tmp_path, rows, assets):
     fine = [row | {"reference": "fine teacher"} for row in rows]
     other = [row | {"scene": "sand"} for row in rows]
-    text, page = write(tmp_path, rows + fine + other, assets)
-    assert text.count("<h2>hand</h2>") == 2 and text.count("<h2>sand</h2>") == 1
-    assert sum(tag == "video" for tag, _ in page.tags) == 1  # pictures belong to the scene, not to each reference
+    text, page = write(tmp_path, rows + fine + other, assets, None)
+    assert text.count("<h2>hand, truth: ") == 2 and text.count("<h2>sand</h2>") == 1
+    assert sum(tag == "img" for tag, _ in page.tags) == 2  # pictures belong to the scene, not to each reference
 
 
 def test_text_is_escaped(tmp_path, rows):
-    text, _ = write(tmp_path, [rows[0] | {"contender": "<b>gns</b>"}], verdict="1 < 2 <script>")
-    assert "<b>" not in text and "<script>" not in text
+    for page in (None, "hand"):
+        text, _ = write(tmp_path, [rows[0] | {"contender": "<b>gns</b>"}], page=page, verdict="1 < 2 <script>", title="<b>")
+        assert "<b>" not in text and "<script>" not in text
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,8 @@ import json
 import pytest
 
 from sim.cli import main
-from sim.paper import DOMAINS, against_paper
+from sim.domains import DOMAINS
+from sim.paper import against_paper
 from sim.scene import SceneFamily
 
 

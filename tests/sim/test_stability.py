@@ -246,6 +246,19 @@ def test_the_page_begins_with_what_went_wrong(tmp_path):
     assert page.count("data:image/svg+xml") == 1 and not re.findall(r"""(?:src|href)=["'](?!data:|#)""", page) and "<script" not in page
 
 
+def test_the_verdict_counts_the_steps_of_the_maps():
+    def step(case, over, refused, outcome):
+        numbers = {"time_step": 0.1 * over, "limit": 0.1, "courant": over, "refused": refused, "outcome": outcome}
+        return row(Cell(case, f"{over}", True, "", "", numbers, 0.1))
+
+    one = [step("young_dt", 0.5, False, "bounded"), step("young_dt", 1.0, False, "not finite"), step("young_dt", 2.0, True, "bounded"),
+           step("young_dt", 3.0, True, "grew"), step("young_dt", 4.0, True, "not finite")]  # fmt: skip
+    said = "1 gained energy unnoticed and 1 failed and said so; of those refused, run all the same, the first to go wrong was "
+    more = [step("sound_dt", 0.5, False, "grew"), step("sound_dt", 1.2, True, "grew")]
+    assert verdict([*one, *more]).endswith(f"Of 3 fixed time steps that were accepted on 2 maps, {said}1.2 to 3 times the limit.")
+    assert verdict(one).endswith(f"accepted on 1 map, 0{said[1:]}3 times the limit.")
+
+
 @pytest.mark.parametrize("name", CASES)
 def test_every_case_has_a_title(name):
     assert ":" in title(name) and callable(case(name).run)

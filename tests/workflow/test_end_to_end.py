@@ -13,6 +13,7 @@ import time
 from pathlib import Path
 
 import pytest
+from browser import check, needs_browser
 from study_tree import begin_snakemake, make_tree, planned, promised, snakemake
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
@@ -26,7 +27,7 @@ ROW_KEYS = {
     "seconds_per_simulated_second", "compile_seconds", "spread",
 }
 KINDS = {"reference": 1, "solver": 2, "learned": 2, "trivial": 5, "oracle": 1, "floor": 1}
-PICTURES = {"figures", "film", "strip", "training_curve"}
+PICTURES = {"figures", "speed_ups", "film", "strip", "training_curve"}
 
 
 def refuse(constant: str):
@@ -64,19 +65,43 @@ def test_the_yardsticks_are_in_order(summary):
     assert "Missed: gns on puddle" in summary["verdict"]
 
 
-def test_the_report_stands_alone(finished, summary):
-    page = (finished / "results" / "micro" / "report.html").read_text()
-    text = re.sub(r"<[^>]+>|\s+", " ", page)
+def test_the_report_stands_alone_and_has_a_page_a_scene(finished, summary):
+    results = finished / "results" / "micro"
+    entry, page = (results / "report.html").read_text(), (results / "report" / "puddle.html").read_text()
+    text = re.sub(r"<[^>]+>|\s+", " ", entry)
     assert summary["verdict"][:60] in text.replace("&#39;", "'")
-    assert not re.findall(r"""(?:src|href|poster)=["'](?!data:|#)""", page) and "<script" not in page and "@import" not in page
-    assert page.count("data:video/mp4") == 1 and page.count("data:image/svg+xml") >= 4 and page.count("data:image/png") >= 2
+    for each in (entry, page):
+        assert not re.findall(r"""(?:src|poster)=["'](?!data:)""", each) and "<script" not in each and "@import" not in each
+    assert set(re.findall(r'href="([^"]*)"', entry)) == {"report/puddle.html"} and 'id="puddle"' in entry and 'id="provenance"' in entry
+    assert set(re.findall(r'href="([^"]*)"', page)) == {"../report.html#puddle", "../report.html#provenance"}
+    assert entry.count("data:video/mp4") == 0 and entry.count("data:image/svg+xml") == 2 and entry.count("data:image/png") == 1
+    assert page.count("data:video/mp4") == 1 and page.count("data:image/svg+xml") == 4 and page.count("data:image/png") == 2
+    ones = ("learning_data", "test_data", "errors", "timing", "rollouts", "film", "strip", "figures", "training_curve")
+    assert {job["rule"]: job["jobs"] for job in summary["jobs"]} == dict.fromkeys(ones, 1) | {"train": 2}
+    assert "micro_gns.yaml" in text and "snakemake --config study=configs/studies/micro.yaml" in text
+
+
+@needs_browser
+def test_the_report_in_a_browser(finished, tmp_path):
+    results = finished / "results" / "micro"
+    assert len(check(results / "report.html", tmp_path).media) == 3
+    assert len(check(results / "report" / "puddle.html", tmp_path).media) == 7  # the film's poster is one of them
+
+
+def test_snakemake_makes_a_report_of_its_own(finished, tmp_path):
+    code, output = snakemake(finished, "--report", str(tmp_path / "own.html"))
+    assert code == 0 and "downloading" not in output, output
+    page = (tmp_path / "own.html").read_text()
+    for name in ("report.html", "puddle.html", "grid.mp4", "error_over_run_time.svg", "speed_ups.svg"):
+        assert f"filename={name};" in page, name
+    assert "seconds a frame, one thread each" in page
 
 
 def test_every_job_leaves_log_and_benchmark(finished):
     results = finished / "results" / "micro"
     logs = {path.relative_to(results / "logs").with_suffix("") for path in (results / "logs").rglob("*.log")}
     benchmarks = {path.relative_to(results / "benchmarks").with_suffix("") for path in (results / "benchmarks").rglob("*.tsv")}
-    assert logs == benchmarks and len(logs) == 12
+    assert logs == benchmarks and len(logs) == 13
 
 
 def test_nothing_is_made_twice(finished):
@@ -118,12 +143,12 @@ EDITS = {
     ),
     "rendering": (lambda tree: append(tree / "sim" / "render.py"), {"film", "strip", "report"}),
     "template": (lambda tree: append(tree / "learn" / "report_template.html", "<!-- edited -->"), {"report"}),
-    "figures": (lambda tree: append(tree / "learn" / "figures.py"), {"figures", "training_curve", "report"}),
+    "figures": (lambda tree: append(tree / "learn" / "figures.py"), {"figures", "speed_ups", "training_curve", "report"}),
     "report": (lambda tree: append(tree / "learn" / "report.py"), {"report"}),
     "target": (lambda tree: replace(tree / "configs" / "studies" / "micro.yaml", "1.0e-12", "1.0"), {"report"}),
     "rung": (
         lambda tree: replace(tree / "configs" / "studies" / "micro.yaml", "cfl: 0.8", "cfl: 0.9"),
-        {"errors", "timing", "rollouts", "figures", "film", "strip", "report"},
+        {"errors", "timing", "rollouts", "figures", "speed_ups", "film", "strip", "report"},
     ),
 }
 
@@ -247,7 +272,7 @@ def test_killed_at_random_instants_it_ends_with_the_same_results(finished, tmp_p
 
 
 def test_the_report_on_a_full_disk(finished, tmp_path):
-    """Under the summary, then under the page: one line in the job's log, nothing half written, and with room the same page."""
+    """Under the summary, the pages, the entry: one line in the job's log, nothing half written, and with room the same pages."""
     made, disk = finished / "results" / "micro", tmp_path / "disk"
     command = [sys.executable, "-m", "workflow.scripts.summary", "configs/studies/micro.yaml", disk / "summary.json", disk / "report.html"]
 
@@ -256,13 +281,18 @@ def test_the_report_on_a_full_disk(finished, tmp_path):
         return done.returncode, done.stderr
 
     with small_disk(disk) as leave:
-        for free, name, left in ((4096, "summary.json", []), (64 * 4096, "report.html", ["summary.json"])):
+        summary, page, entry = ((made / name).stat().st_size for name in ("summary.json", "report/puddle.html", "report.html"))
+        for free, name, left in (
+            (4096, "summary.json", []), (summary + page // 2, "report", ["summary.json"]),
+            (page + entry // 2, "report.html", ["summary.json", "report"]),  # the summary is there, and makes way for its like
+        ):
             leave(free)
             assert write() == (1, f"sluice: {disk / name}: No space left on device\n")
             assert sorted(os.listdir(disk)) == sorted(["filler", *left])
         leave(None)
         assert write() == (0, "")
-        assert (disk / "report.html").read_bytes() == (made / "report.html").read_bytes()
+        for name in ("report.html", "report/puddle.html"):
+            assert (disk / name).read_bytes() == (made / name).read_bytes()
 
 
 # A shipped checkpoint -------------------------------------------------------------------------------------------------------
@@ -298,5 +328,7 @@ def test_a_checkpoint_is_compared_without_training(copied):
     (row,) = [row for row in made["rows"] if row["kind"] == "learned"]
     assert row["contender"] == "shipped" and row["status"] == "ok" and row["cost"]["steps"] == 300
     page = (copied / "results" / "shipped" / "report.html").read_text()
-    assert "data:video" not in page and page.count("data:image/svg+xml") == 5  # four figures and the curve of the shipped training
+    assert "data:video" not in page and page.count("data:image/svg+xml") == 3  # speed-ups, beyond the training, error over run time
+    scene = (copied / "results" / "shipped" / "report" / "puddle.html").read_text()
+    assert "data:video" not in scene and scene.count("data:image/svg+xml") == 5  # four figures and the curve of the shipped training
     assert "Median MSE of the rollout, and as a multiple of the best trivial baseline&#39;s. shipped: puddle" in page

@@ -305,6 +305,8 @@ EDITS = [
     ("learn/metrics.py", None, {*LEARNED, *COMPARED, "report"}),  # trainings choose their best weights by it
     ("learn/compare.py", None, COMPARED | {"report"}),
     ("learn/report_template.html", None, {"report"}),
+    ("learn/scene_template.html", None, {"report"}),
+    ("sim/page.css", None, {"report"}),
     ("learn/generalisation.py", None, {"report"}),
     ("learn/figures.py", None, set()),
     ("sim/render.py", None, set()),

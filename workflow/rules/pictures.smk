@@ -35,7 +35,10 @@ rule film:
         rollouts=f"{RESULTS}/comparisons/{{comparison}}/rollouts",
         timing=f"{RESULTS}/comparisons/{{comparison}}/timing.json",
     output:
-        film=f"{RESULTS}/pictures/{{comparison}}/{{model}}.mp4",
+        film=report(
+            f"{RESULTS}/pictures/{{comparison}}/{{model}}.mp4",
+            caption="../report/film.rst", category="{comparison}", labels={"figure": "film of {model}"},
+        ),
         still=f"{RESULTS}/pictures/{{comparison}}/{{model}}.png",
     params:
         code=code_hash("workflow.scripts.film"),
@@ -83,7 +86,10 @@ rule figures:
         rows=f"{RESULTS}/comparisons/{{comparison}}/errors.json",
         timing=f"{RESULTS}/comparisons/{{comparison}}/timing.json",
     output:
-        f"{RESULTS}/pictures/{{comparison}}/error_over_run_time.svg",
+        report(
+            f"{RESULTS}/pictures/{{comparison}}/error_over_run_time.svg",
+            caption="../report/error_over_run_time.rst", category="{comparison}", labels={"figure": "error over run time"},
+        ),
         f"{RESULTS}/pictures/{{comparison}}/error_over_time.svg",
         f"{RESULTS}/pictures/{{comparison}}/kinetic_energy.svg",
     params:
@@ -102,11 +108,35 @@ rule figures:
         "{PYTHON} -m workflow.scripts.figures {input.rows} {input.timing} {output} > {log} 2>&1"
 
 
+rule speed_ups:
+    input:
+        [STUDY.comparison_file(comparison, f"{name}.json") for comparison in STUDY.comparisons for name in ("errors", "timing")],
+    output:
+        report(f"{RESULTS}/pictures/speed_ups.svg", caption="../report/speed_ups.rst", category="Report"),
+    params:
+        code=code_hash("workflow.scripts.speed_ups"),
+    log:
+        f"{RESULTS}/logs/speed_ups.log",
+    benchmark:
+        f"{RESULTS}/benchmarks/speed_ups.tsv"
+    threads: 1
+    resources:
+        mem_mb=2000,
+        runtime=10,
+    message:
+        "Figure of the speed-ups"
+    shell:
+        "{PYTHON} -m workflow.scripts.speed_ups {output} {input} > {log} 2>&1"
+
+
 rule ablation:
     input:
         rows=f"{RESULTS}/comparisons/{{comparison}}/errors.json",
     output:
-        f"{RESULTS}/pictures/{{comparison}}/ablation.svg",
+        report(
+            f"{RESULTS}/pictures/{{comparison}}/ablation.svg",
+            caption="../report/ablation.rst", category="{comparison}", labels={"figure": "ablations"},
+        ),
     params:
         code=lambda wildcards: STUDY.comparison_recipe(wildcards.comparison, ("axes",), "ablation"),
     log:
@@ -127,7 +157,10 @@ rule generalisation:
     input:
         lambda wildcards: [STUDY.comparison_file(name, "errors.json") for name in STUDY.generalised(wildcards.comparison)],
     output:
-        f"{RESULTS}/pictures/{{comparison}}/generalisation.svg",
+        report(
+            f"{RESULTS}/pictures/{{comparison}}/generalisation.svg",
+            caption="../report/generalisation.rst", category="{comparison}", labels={"figure": "beyond the training"},
+        ),
     params:
         code=lambda wildcards: STUDY.comparison_recipe(wildcards.comparison, ("generalisation",), "generalisation"),
     log:

@@ -1,9 +1,9 @@
-"""Summary and report of a study."""
+"""Summary and report of a study; what ``snakemake --report`` shows is marked where it is made."""
 
 
 def pictures(wildcards):
     """What the report embeds: see ``workflow.results.assets``."""
-    return [path for comparison in STUDY.comparisons for path in STUDY.pictures(comparison)]
+    return STUDY.overview + [path for comparison in STUDY.comparisons for path in STUDY.pictures(comparison)]
 
 
 rule report:
@@ -14,7 +14,8 @@ rule report:
         pictures,
     output:
         summary=f"{RESULTS}/summary.json",
-        report=f"{RESULTS}/report.html",
+        report=report(f"{RESULTS}/report.html", caption="../report/report.rst", category="Report"),
+        pages=report(directory(f"{RESULTS}/report"), patterns=["{scene}.html"], caption="../report/scene.rst", category="Report"),
     params:
         recipe=STUDY.report_recipe(),
     log:
@@ -28,4 +29,4 @@ rule report:
     message:
         "Writing {output.report}"
     shell:
-        "{PYTHON} -m workflow.scripts.summary {STUDY.path} {output} > {log} 2>&1"
+        "{PYTHON} -m workflow.scripts.summary {STUDY.path} {output.summary} {output.report} > {log} 2>&1"

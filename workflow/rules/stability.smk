@@ -26,7 +26,7 @@ rule report:
         expand(f"{RESULTS}/cells/{{job}}.json", job=STUDY.stability),
     output:
         summary=f"{RESULTS}/summary.json",
-        report=f"{RESULTS}/report.html",
+        report=report(f"{RESULTS}/report.html", caption="../report/stability.rst", category="Report"),
     params:
         recipe=STUDY.stability_recipe(),
     log:
