@@ -309,7 +309,7 @@ def pile_angle(position: np.ndarray, bounds: np.ndarray, gravity: np.ndarray, sp
 # All of it ------------------------------------------------------------------------------------------------------------------
 
 
-#: What ``cloud_metrics`` measures, in its order.
+#: What ``cloud_metrics`` measures.
 CLOUD_METRICS = (
     "sinkhorn", "emd", "spacing_ratio", "density_error_mean", "density_error_max", "centre_of_mass_error", "front_error", "width_ratio",
     "height_ratio", "pile_angle_error",
@@ -333,24 +333,23 @@ def cloud_metrics(p: np.ndarray, q: np.ndarray, trajectory: Trajectory, *, emd_p
 
     few, some = subsample(len(p), sinkhorn_particles), subsample(len(p), emd_particles)
     mean, largest = density_error(p, q, bounds, spacing, period)
-    anywhere = (
-        sinkhorn_divergence(p[few], q[few], trajectory.radius**2, period),
-        earth_movers_distance(p[some], q[some], spacing, period),
-        spacing_ratio(p, q, period),
-        mean,
-        largest,
-        centre_of_mass_error(p, q, spacing),
-    )
-    if period is not None:
-        return dict.fromkeys(CLOUD_METRICS) | dict(zip(CLOUD_METRICS, anywhere, strict=False))
-    angles = [pile_angle(cloud, bounds, gravity, spacing) for cloud in (p, q)]
-    between_walls = (
-        abs(front(p, gravity) - front(q, gravity)) / spacing,
-        ratio(width(p, gravity), width(q, gravity)),
-        ratio(pile_height(p, bounds, gravity), pile_height(q, bounds, gravity)),
-        None if None in angles else abs(angles[0] - angles[1]),
-    )
-    return dict(zip(CLOUD_METRICS, anywhere + between_walls, strict=True))
+    found = {
+        "sinkhorn": sinkhorn_divergence(p[few], q[few], trajectory.radius**2, period),
+        "emd": earth_movers_distance(p[some], q[some], spacing, period),
+        "spacing_ratio": spacing_ratio(p, q, period),
+        "density_error_mean": mean,
+        "density_error_max": largest,
+        "centre_of_mass_error": centre_of_mass_error(p, q, spacing),
+    }
+    if period is None:
+        angles = [pile_angle(cloud, bounds, gravity, spacing) for cloud in (p, q)]
+        found |= {
+            "front_error": abs(front(p, gravity) - front(q, gravity)) / spacing,
+            "width_ratio": ratio(width(p, gravity), width(q, gravity)),
+            "height_ratio": ratio(pile_height(p, bounds, gravity), pile_height(q, bounds, gravity)),
+            "pile_angle_error": None if None in angles else abs(angles[0] - angles[1]),
+        }
+    return dict.fromkeys(CLOUD_METRICS) | found
 
 
 def evaluate(
