@@ -86,6 +86,14 @@ def test_dict_is_json_and_inverts():
         Scene.from_dict(content | {"colour": "blue"}, "meta")
 
 
+def test_a_scene_read_back_has_its_particles_in_their_order():
+    # Files sort the keys of the scene they hold: water and sand become sand and water.
+    scene = family().sample(3)
+    again = Scene.from_dict(json.loads(json.dumps(scene.to_dict(), sort_keys=True)))
+    assert len(set(scene.particle_type())) == 2
+    assert np.array_equal(again.particle_type(), scene.particle_type()) and np.array_equal(again.start(), scene.start())
+
+
 @pytest.mark.parametrize("make", [family, cube])
 @pytest.mark.parametrize("refine", [1, 2, 3])
 def test_the_recorded_set_is_the_same_in_every_rung(make, refine):
