@@ -264,8 +264,7 @@ class _Physics(_Strict):
     solver: Solver = MaterialPoints(method="mpm")
     #: Axes along which the box repeats itself ("x", ...), without walls there (SPH).
     periodic: list[Literal["x", "y", "z"]] = []
-    # By name: particles lie in the order of the materials, which a scene read back from a file (JSON of sorted keys) must share.
-    materials: Annotated[dict[str, Material], AfterValidator(lambda materials: dict(sorted(materials.items())))]
+    materials: dict[str, Material]
     #: Material numbers ("material.key") that every frame's context repeats, after the container's acceleration if there is one.
     context: list[str] = []
 

@@ -220,7 +220,8 @@ def write_shard(path: str | Path, trajectories: dict[int, Trajectory] | Iterable
                 "simulator": trajectory.simulator,
                 "status": trajectory.status,
             }
-            group.attrs["meta"] = json.dumps(meta, sort_keys=True)
+            # Keys in the scene's own order: particles lie in the order of its materials.
+            group.attrs["meta"] = json.dumps(meta)
             disk.check()
 
 
