@@ -11,7 +11,7 @@ import io
 import json
 import warnings
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeVar
@@ -85,7 +85,7 @@ def read_content(path: str | Path, device: torch.device | str, form: str, remedy
         raise InputError(path, "file", reason, f"damaged, or not a {form} file; {remedy}") from None
 
 
-def _read(path: str | Path, form: str, keys: dict[str, type], device: torch.device | str, remedy: str) -> dict:
+def _read(path: str | Path, form: str, keys: Mapping[str, type], device: torch.device | str, remedy: str) -> dict:
     """The content of a file of format ``form``, checked to have ``keys`` of these types and no other."""
     content = read_content(path, device, form, remedy)
     if not isinstance(content, dict) or content.get("format") != form:

@@ -30,7 +30,7 @@ class Container(Strict):
         read as context is all there is to know; with a(t) a substep, the truth would depend on what no frame tells.
         """
         t = frame_step * np.arange(frames + 1)
-        total = 0.0
+        total = np.zeros((frames, 1))
         for sine in self.sines:
             w = 2 * np.pi * sine.frequency
             integral = -np.cos(w * t + np.radians(sine.phase)) / w

@@ -323,6 +323,7 @@ class _Family(Strict):
             raise mistake(f"{where}.count", list(self.count), "low must not exceed high")
 
     def place(self, bounds: np.ndarray, rng: np.random.Generator) -> _Solid:
+        """Draw one."""
         raise NotImplementedError
 
 
@@ -386,13 +387,15 @@ class PolygonFamily(_Family):
             return
         if self.center is not None:
             raise mistake(f"{where}.center", self.center, "fixed vertices have their place; remove center")
-        for index, vertex in enumerate(self.vertices):
+        vertices = self.vertices or []
+        for index, vertex in enumerate(vertices):
             check_vectors(where, {f"vertices[{index}]": vertex}, dim)
-        _check_outline(where, self.vertices)
+        _check_outline(where, vertices)
 
     def place(self, bounds: np.ndarray, rng: np.random.Generator) -> Polygon:
         if self.vertices is not None:
             return Polygon(kind="polygon", vertices=self.vertices, friction=self.friction)
+        assert self.radius is not None  # by ``check``
         radius, corners = sample(self.radius, rng), int(rng.integers(self.corners[0], self.corners[1] + 1))
         angles = rng.uniform(0, 2 * np.pi) + 2 * np.pi / corners * (np.arange(corners) + rng.uniform(-0.25, 0.25, corners))
         center = _center(self.center, np.full(2, radius), bounds, rng)
@@ -465,7 +468,7 @@ class FloorFamily(_Family):
 
     def place(self, bounds: np.ndarray, rng: np.random.Generator) -> Floor:
         pieces = int(rng.integers(self.pieces[0], self.pieces[1] + 1))
-        vertices = [[float(x), sample(self.height, rng)] for x in np.linspace(*bounds[0], pieces + 1)]
+        vertices = [[float(x), sample(self.height, rng)] for x in np.linspace(bounds[0, 0], bounds[0, 1], pieces + 1)]
         return Floor(kind="floor", vertices=vertices, friction=self.friction)
 
 
@@ -507,7 +510,8 @@ class MeshFamily(_Family):
         vertices, faces = np.asarray(surface.points, float), np.asarray(surface.regular_faces)
         return vertices - (vertices.min(0) + vertices.max(0)) / 2, faces
 
-    def place(self, bounds: np.ndarray, rng: np.random.Generator, geometry: tuple[np.ndarray, np.ndarray]) -> Mesh:
+    def place_mesh(self, bounds: np.ndarray, rng: np.random.Generator, geometry: tuple[np.ndarray, np.ndarray]) -> Mesh:
+        """Draw one of what ``read`` has found."""
         vertices = geometry[0] * sample(self.scale, rng)
         vertices = vertices + _center(self.center, np.ptp(vertices, axis=0) / 2, bounds, rng)
         return Mesh(kind="mesh", vertices=vertices.tolist(), faces=geometry[1].tolist(), friction=self.friction)
@@ -545,7 +549,7 @@ def outside(obstacle: _Solid, anywhere: bool, bounds: np.ndarray) -> str | None:
         corners = np.stack(np.meshgrid(*bounds, indexing="ij"), -1).reshape(-1, len(bounds))
         signs = obstacle.distance(corners)[0] < 0
         crosses = signs.any() and not signs.all()
-        if obstacle.kind == "floor":
+        if isinstance(obstacle, Floor):
             heights = np.array(obstacle.vertices)[:, 1]
             crosses = heights.max() > lower[1] and heights.max() < upper[1]
         return None if crosses else "outside the box, or filling it"

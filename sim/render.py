@@ -357,13 +357,13 @@ class _Sheet:
         for row, line in enumerate(lines):
             if one_scale and row < rows - 1:
                 continue
-            top = self.corners[row * columns][1] + view.height + bar / 2
+            middle = self.corners[row * columns][1] + view.height + bar / 2
             first = 0
             for column in range(1, len(line) + 1):
                 if column == len(line) or line[column].scale is not line[first].scale:
                     left = self.corners[row * columns + first][0]
                     right = self.corners[row * columns + column - 1][0] + view.width
-                    self._legend(draw, line[first].scale, (left + right) / 2, top, unit)
+                    self._legend(draw, line[first].scale, (left + right) / 2, middle, unit)
                     first = column
 
     def _legend(self, draw, scale: Scale, middle: float, y: float, unit: float) -> None:
@@ -384,8 +384,8 @@ class _Sheet:
         draw.text((x, y), low, MUTED, self.font, anchor="lm")
         x += wide(low) + space
         for i in range(length):
-            colour = tuple(int(c) for c in scale.table[i * (len(scale.table) - 1) // (length - 1)])
-            draw.line((x + i, y - thick / 2, x + i, y + thick / 2), fill=colour)
+            shade = tuple(int(c) for c in scale.table[i * (len(scale.table) - 1) // (length - 1)])
+            draw.line((x + i, y - thick / 2, x + i, y + thick / 2), fill=shade)
         draw.text((x + length + space, y), high, MUTED, self.font, anchor="lm")
 
     def picture(self, parts: Sequence[np.ndarray], footer: str) -> np.ndarray:
@@ -443,10 +443,11 @@ def render_film(
     with atomic_path(path) as temporary, tempfile.TemporaryFile() as said:
         command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-v", "error", *raw, *coded, str(temporary)]
         with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=said, start_new_session=True) as ffmpeg:
+            assert ffmpeg.stdin is not None  # a pipe
             try:
                 with suppress(BrokenPipeError):  # it ended early; its exit code tells
                     for picture in pictures:
-                        ffmpeg.stdin.write(np.ascontiguousarray(picture))
+                        ffmpeg.stdin.write(np.ascontiguousarray(picture).data)
                     ffmpeg.stdin.close()
                 failed = ffmpeg.wait()
             except BaseException:

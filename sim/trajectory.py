@@ -19,6 +19,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -147,7 +148,7 @@ class Disk(io.FileIO):
 
     error: BaseException | None = None
 
-    def write(self, data: memoryview) -> int:
+    def write(self, data: Any) -> int:
         try:
             rest = memoryview(data).cast("B")
             while self.error is None and rest:
@@ -161,7 +162,7 @@ class Disk(io.FileIO):
             return super().truncate(size)
         except BaseException as error:
             self.error = self.error or error
-            return size
+            return size or 0
 
     def check(self) -> None:
         """Raise what went wrong."""

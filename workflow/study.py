@@ -321,9 +321,9 @@ def _check_comparison(study: Study, name: str, entry: dict) -> None:
         if metric.startswith("rollout_mse"):
             moments = [str(horizon) for horizon in entry["horizons"]] + ["all"]
         else:
-            moments = [f"{share:g}" for share in CLOUD_TIMES] if metric in CLOUD_METRICS else [None]
-        if at not in moments:
-            remedy = f"{metric} is known at {', '.join(moments)}" if moments[0] else f"{metric} is one figure; leave it out"
+            moments = [f"{share:g}" for share in CLOUD_TIMES] if metric in CLOUD_METRICS else []
+        if at not in moments and not (at is None and not moments):
+            remedy = f"{metric} is known at {', '.join(moments)}" if moments else f"{metric} is one figure; leave it out"
             raise InputError(path, f"{where}.targets[{index}].at", target.get("at"), remedy)
 
 

@@ -26,7 +26,7 @@ def constant(dim: int) -> float:
     return {2: 7 / np.pi, 3: 21 / (2 * np.pi)}[dim]
 
 
-def kernel(dim: int, r: np.ndarray) -> np.ndarray:
+def kernel(dim: int, r: np.ndarray | float) -> np.ndarray:
     """W at distances r [...]."""
     r = np.minimum(r, 1.0)
     return constant(dim) * (1 - r) ** 4 * (1 + 4 * r)
