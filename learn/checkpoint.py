@@ -169,7 +169,7 @@ def load_model(path: str | Path, device: torch.device | str = "cpu") -> nn.Modul
 
 
 def load_weights(model: nn.Module, weights: dict, where: object) -> None:
-    """Copy ``weights`` (on the CPU) into ``model``; names, shapes and types must fit exactly and every number be finite."""
+    """Copy ``weights`` (on the CPU) into ``model``; names, shapes and types must fit exactly and every number be finite, or ``InputError``."""
     own = model.state_dict()
     if set(weights) != set(own):
         raise InputError(where, "state_dict", sorted(set(map(str, weights)) ^ set(own))[:5], "names of weights do not fit the model's settings")

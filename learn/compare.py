@@ -368,6 +368,7 @@ class Yardstick:
     over: Literal["median", "mean"] = "median"  # of the trajectories
 
     def of(self, row: dict) -> float | None:
+        """The figure of a row, None where it is undefined or failed."""
         value = (row["mean"] if self.over == "mean" else row)[self.metric]
         return value.get(self.at) if isinstance(value, dict) else value
 

@@ -152,6 +152,7 @@ class Windows:
 
     @property
     def examples(self) -> int:
+        """Graphs in the batch."""
         return int(self.example[-1]) + 1
 
     def to(self, device: torch.device | str) -> Windows:
@@ -455,7 +456,7 @@ class Sampler:
     windows left at the end are dropped. A new window length (a model may lengthen its unrolling as training goes) begins a new epoch.
 
     A batch has ``batch`` windows, or those of at most so many ``edges``, estimated as particles times the data's mean neighbours; one at least for
-    each of ``processes``, of which it then holds this one's share.
+    each of ``processes``, of which it then holds this one's share. Raises ``InputError`` for data that cannot be drawn from so.
     """
 
     def __init__(self, dataset: Dataset, settings: DataSettings, batch: int | None, seed: int, edges: int | None = None,

@@ -177,7 +177,7 @@ def export_model(model: GNS, out: str | Path) -> dict:
 
 
 def port_weights(model: GNS) -> dict[str, Tensor]:
-    """The model as a state_dict of the port, float32, in the port's order."""
+    """The model as a state_dict of the port, float32, in the port's order: name -> [outputs, inputs] or [outputs]."""
     own = {name: value.detach().cpu().double() for name, value in model.state_dict().items()}
     features, port = model.features, {}
     port[_EMBEDDING] = own["features.embedding.weight"] if features.embedding else torch.zeros(TYPE_SLOTS, TYPE_WIDTH, dtype=torch.float64)

@@ -34,7 +34,7 @@ NoiseScheme = Literal["random_walk", "uncorrelated", "correlated", "last"]
 def random_walk_noise(
     position: Tensor, sigma: float | Tensor, generator: torch.Generator, moving: Tensor | None = None, place: tuple[int, int] | None = None
 ) -> Tensor:
-    """``velocity_noise`` as the paper has it."""
+    """``velocity_noise`` as the paper has it, [frames, particles, dim]."""
     return velocity_noise("random_walk", position, sigma, generator, moving, place)
 
 

@@ -343,6 +343,7 @@ class Weights:
     width: int
 
     def arguments(self) -> tuple:
+        """As the kernels take them."""
         b0, b1, b2, gamma, beta = self.vectors
         latent = len(self.second)
         first = TensorDescriptor.from_tensor(self.first, [latent, self.width])
@@ -373,6 +374,7 @@ class Shadow:
 
     @torch.no_grad()
     def refresh(self) -> None:
+        """Copy the network's weights as they are now."""
         torch._foreach_copy_(self._copies, self._sources)
 
     def __getitem__(self, mlp: MLP) -> Weights:
@@ -547,7 +549,7 @@ def supports(network: Network) -> bool:
 
 
 def forward(network: Network, nodes: Tensor, edges: Tensor, graph: PaddedGraph) -> Tensor:
-    """``Network.forward`` on a ``PaddedGraph``, by the weights in ``network.shadow``."""
+    """``Network.forward`` on a ``PaddedGraph``, by the weights in ``network.shadow``: [particles, dim]."""
     shadow = network.shadow
     assert shadow is not None
     keep = torch.is_grad_enabled()

@@ -132,6 +132,7 @@ class Residual(nn.Module):
             self.convolution.weight.mul_(0.7)
 
     def forward(self, x: Tensor, neighbours: Tensor) -> Tensor:
+        """x [nodes, channels], neighbours as of ``StencilConv``."""
         return x + self.convolution(functional.relu(x), neighbours)
 
 
@@ -235,7 +236,10 @@ class SparseUNet(nn.Module):
 
 
 class GridEmulator(nn.Module):
-    """The grid emulator as a learned model and as a simulator; the equations are at the head of this file."""
+    """The grid emulator as a learned model and as a simulator; the equations are at the head of this file.
+
+    Raises ``InputError`` for data that it is not made for (periodic boxes, grids too large).
+    """
 
     Settings = GridEmulatorSettings
     name = "grid_emulator"

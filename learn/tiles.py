@@ -116,7 +116,7 @@ def _declared(library: ctypes.CDLL) -> ctypes.CDLL:
 
 
 def supports(latent: int, layers: int, dtype: torch.dtype, weight: Tensor) -> bool:
-    """Whether the kernels take an MLP of this width, with so many layers after the first, products in ``dtype``, and this of its weights."""
+    """Whether the kernels take an MLP of this width, with so many layers after the first, products in ``dtype``, this weight [outputs, inputs]."""
     if weight.device.type != "cpu" or weight.dtype != torch.float32 or dtype not in (torch.float32, torch.bfloat16):
         return False
     if layers > MOST or latent > WIDEST or (library := build()) is None:
@@ -155,7 +155,7 @@ def _shares(graph: Graph) -> list[tuple[int, int, int, int]]:
 def edge_pass(
     graph: Graph, table: Tensor, edges: Tensor, first: Tensor, rest: Sequence[Tensor], epsilon: float, update: bool, keep: bool
 ) -> tuple[Tensor, Tensor | None, tuple[Tensor, ...]]:
-    """``learn.gns._edge_pass``: the same arguments and results, ``dtype`` being that of ``edges``."""
+    """``learn.gns._edge_pass``: the same arguments and results, edges [edges, latent], ``dtype`` being that of ``edges``."""
     *layers, gamma, beta = rest
     receiver, sender = graph.receiver.int(), graph.sender.int()
     latent, count, dtype = len(gamma), len(layers) // 2, edges.dtype

@@ -360,6 +360,7 @@ class Trainer:
 
     @property
     def step(self) -> int:
+        """Optimiser steps done."""
         return self.progress_state["step"]
 
     def seconds(self) -> float:

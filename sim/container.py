@@ -47,6 +47,7 @@ class ContainerFamily(Strict):
     phase: Range | Literal["any"] = "any"
 
     def check(self, dim: int) -> None:
+        """Raise the first fault of a family in ``dim`` dimensions."""
         if self.sines[0] > self.sines[1]:
             raise mistake("container.sines", list(self.sines), "low must not exceed high")
         check_vectors("container", {"amplitude": self.amplitude}, dim)
@@ -55,6 +56,7 @@ class ContainerFamily(Strict):
             check_range("container.phase", self.phase)
 
     def draw(self, rng: np.random.Generator) -> Container:
+        """One shaking, its numbers fixed."""
         phase = (0.0, 360.0) if self.phase == "any" else self.phase
         return Container(sines=[
             Sine(amplitude=[sample(value, rng) for value in self.amplitude], frequency=sample(self.frequency, rng), phase=sample(phase, rng))

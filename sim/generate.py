@@ -120,10 +120,12 @@ class Shard:
 
     @property
     def name(self) -> str:
+        """The shard's file within the data set."""
         return f"{self.split}/shard-{self.number:05d}.h5"
 
     @property
     def cost_name(self) -> str:
+        """What it cost and which trajectories failed, beside it."""
         return f"{self.split}/shard-{self.number:05d}.cost.json"
 
 

@@ -73,6 +73,7 @@ class _Solid(Strict):
         return None
 
     def distance(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Signed distance [n] and outward normal [n, dim] of points [n, dim], as the head of this file says."""
         raise NotImplementedError
 
     def _beyond(self, corners: np.ndarray) -> np.ndarray:
@@ -404,6 +405,8 @@ class PolygonFamily(_Family):
 
 
 class BallFamily(_Family):
+    """Discs (2D) or balls (3D)."""
+
     kind: Literal["ball"]
     radius: Range
     center: list[Range] | None = None
@@ -420,6 +423,8 @@ class BallFamily(_Family):
 
 
 class BoxFamily(_Family):
+    """Rectangles (2D) or boxes (3D) along the axes, ``size`` [low, high] an axis."""
+
     kind: Literal["box"]
     size: list[Range]
     center: list[Range] | None = None
@@ -437,6 +442,8 @@ class BoxFamily(_Family):
 
 
 class HalfspaceFamily(_Family):
+    """Everything behind a plane through ``point``, on the side that ``normal`` points away from."""
+
     kind: Literal["halfspace"]
     point: list[Range]
     normal: list[Range]
@@ -542,7 +549,7 @@ def _check_outline(where: str, vertices: list[list[float]]) -> None:
 
 
 def outside(obstacle: _Solid, anywhere: bool, bounds: np.ndarray) -> str | None:
-    """Why an obstacle is not where it must be: reaching into the box, and wholly inside where its place was ours to draw."""
+    """Why an obstacle is not where it must be: reaching into the box, ``bounds`` [dim, 2], and wholly inside where its place was ours to draw."""
     lower, upper = bounds.T
     extent = obstacle.extent()
     if extent is None:

@@ -112,20 +112,20 @@ def _round_up(value: float) -> float:
 
 
 def speed_scale(speed: np.ndarray) -> Scale:
-    """Viridis from 0 to the 99.5th percentile of the finite values, rounded up: a single fast droplet must not darken the rest."""
+    """Viridis from 0 to the 99.5th percentile of the finite values [...], rounded up: a single fast droplet must not darken the rest."""
     finite = speed[np.isfinite(speed)]
     return Scale(_table("viridis"), 0.0, _round_up(float(np.percentile(finite, 99.5)) if finite.size else 0.0), "speed")
 
 
 def error_scale(error: np.ndarray) -> Scale:
-    """Light grey to dark red (OrRd) from 0 to the 99th percentile of the finite values (in particle spacings), rounded up."""
+    """Light grey to dark red (OrRd) from 0 to the 99th percentile of the finite values [...] (in particle spacings), rounded up."""
     finite = error[np.isfinite(error)]
     limit = _round_up(float(np.percentile(finite, 99.0)) if finite.size else 0.0)
     return Scale(_table("OrRd", 0.15, (222, 222, 222)), 0.0, limit, "distance to truth, in spacings")
 
 
 def type_scale(particle_type: np.ndarray) -> Scale:
-    """One fixed colour per particle type id, swatches for the types that are present."""
+    """One fixed colour per particle type id [particles], swatches for the types that are present."""
     names = {number: name for name, number in PARTICLE_TYPES.items()}
     table = np.tile(np.asarray(KINEMATIC_GREY, np.uint8), (256, 1))
     for number, name in names.items():
@@ -467,7 +467,7 @@ def render_still(
     path: str | Path, panes: Sequence[Pane], bounds: np.ndarray, spacing: float, *,
     picture: int = 0, footer: str = "", columns: int | None = None, width: int = PANE_WIDTH, gravity: Sequence[float] | None = None,
 ) -> None:  # fmt: skip
-    """Write one picture of the panes as PNG; ``picture`` indexes the panes' pictures, the rest is as in ``render_film``."""
+    """Write one picture of the panes in a box ``bounds`` [dim, 2] as PNG; ``picture`` indexes the panes' pictures, the rest as in ``render_film``."""
     from PIL import Image
 
     chosen = [Pane(pane.title, pane.position[picture][None], pane.value[picture][None], pane.scale) for pane in panes]
@@ -480,7 +480,7 @@ def render_still(
 
 
 def film_frames(frames: int, at_most: int = FILM_FRAMES) -> np.ndarray:
-    """Evenly spaced frame numbers from 0, no more than ``at_most``: every k-th frame, so that motion stays even."""
+    """[pictures]: evenly spaced frame numbers from 0, no more than ``at_most``: every k-th frame, so that motion stays even."""
     return np.arange(0, frames, max(1, math.ceil(frames / at_most)))
 
 

@@ -216,6 +216,7 @@ class Bodies:
 
     @ti.func
     def find_contacts(self, dt):
+        """Contacts of all bodies with walls, obstacles and each other, within what a step dt may close."""
         half = self.half[None]
         self.touching[None] = 0
         for b in range(self.count[None]):
@@ -260,6 +261,7 @@ class Bodies:
 
     @ti.func
     def point_velocity(self, b, at):
+        """Velocity of body b at a place: v + w x r."""
         return self.velocity[b] + self.unit() * self.spin[b].cross(self.arm(b, at))
 
     @ti.func

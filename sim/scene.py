@@ -238,6 +238,8 @@ Solver = Annotated[MaterialPoints | WeaklyCompressible | Incompressible | Positi
 
 
 class Splits(_Strict):
+    """Trajectories of each split, where a command does not say how many."""
+
     train: Annotated[int, Field(ge=0)]
     valid: Annotated[int, Field(ge=0)]
     test: Annotated[int, Field(ge=0)]
@@ -586,7 +588,7 @@ class Scene(_Physics):
 
 
 class SceneFamily:
-    """A validated scene file; ``sample(seed)`` draws a ``Scene``."""
+    """A validated scene file; ``sample(seed)`` draws a ``Scene``. Every mistake in it is an ``InputError``."""
 
     def __init__(self, content: dict, where: object, variant: str | None = None):
         self.where = where
@@ -619,6 +621,7 @@ class SceneFamily:
         return cls(read_yaml(path), path, variant)
 
     def to_dict(self) -> dict:
+        """Plain JSON, of which another family can be made."""
         content = self.model.model_dump(mode="json")
         for (name, key), spread in self.spreads.items():
             content["materials"][name][key] = {split: [list(ends) for ends in ranges] for split, ranges in spread.items()}
@@ -626,7 +629,7 @@ class SceneFamily:
 
     def sample(self, seed: int, split: str = "train") -> Scene:
         """Draw one scene of a split (they differ where a material number's ranges do). Bodies and obstacles are placed by rejection
-        until they lie inside the box and bodies apart from each other and from obstacles."""
+        until they lie inside the box and bodies apart from each other and from obstacles. Raises ``InputError`` where that cannot be done."""
         model = self.model
         rng = np.random.default_rng(np.random.SeedSequence([seed, 0]))
         shared = {name: getattr(model, name) for name in _Physics.model_fields}

@@ -61,6 +61,7 @@ class Trajectory:
 
     @property
     def ok(self) -> bool:
+        """Whether it ran to its end."""
         return self.status == "ok"
 
     @property
@@ -120,7 +121,7 @@ def vacant(path: str | Path) -> Path:
 def atomic_folder(path: Path) -> Iterator[Path]:
     """Yield a temporary folder beside ``path``; on success flush its files and rename it, on any error remove it. Complete or absent.
 
-    A write in it that fails is an ``OSError`` that names ``path``, as by ``atomic_path``.
+    A write in it that fails is an ``OSError`` that names ``path``, as by ``atomic_path``; a folder that cannot be made, an ``InputError``.
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
@@ -149,6 +150,7 @@ class Disk(io.FileIO):
     error: BaseException | None = None
 
     def write(self, data: Any) -> int:
+        """As of any file; what is written after an error is dropped."""
         try:
             rest = memoryview(data).cast("B")
             while self.error is None and rest:
@@ -158,6 +160,7 @@ class Disk(io.FileIO):
         return len(data)
 
     def truncate(self, size: int | None = None) -> int:
+        """As of any file; an error is kept."""
         try:
             return super().truncate(size)
         except BaseException as error:
@@ -280,6 +283,7 @@ class ShardReader:
 
     @property
     def file(self) -> h5py.File:
+        """The open file. Raises ``InputError`` where it is absent, damaged or of another version."""
         if self._file is None:
             if not self.path.is_file():
                 raise InputError(self.path, "file", str(self.path), "no such shard; generate it or correct the path")
@@ -296,6 +300,7 @@ class ShardReader:
         return self._file
 
     def close(self) -> None:
+        """Close the file; reading opens it again."""
         if self._file is not None:
             self._file.close()
             self._file = None

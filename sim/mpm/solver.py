@@ -810,7 +810,7 @@ class MPMSimulator:
     model that predicts so many does: one launch, and one plan of the time step, for all).
 
     A scene's ``time_step`` holds unless ``cfl`` is given. ``unguarded_step`` [s] is for ``sim.stability`` alone: a fixed step that nothing
-    refuses or shortens, to see where the solver really becomes unstable.
+    refuses or shortens, to see where the solver really becomes unstable. Raises ``InputError`` for overrides that cannot go together.
     """
 
     def __init__(self, *, name: str = "mpm", kind: Kind = "reference", cfl: float | None = None, stiffness: float = 1.0, coarsen: float = 1.0,

@@ -492,7 +492,7 @@ class PBDSimulator:
 
     Overrides make the rungs of a solver ladder: ``cfl`` (Courant number; default the scene's), ``particles`` ("teacher": refined as the scene
     says; "recorded": the tracked set alone; a number: so many times finer), ``tolerance`` (factor on the error at which a solve ends),
-    ``perturbation`` (length: random displacement of the start, for the chaos floor).
+    ``perturbation`` (length: random displacement of the start, for the chaos floor). Raises ``InputError`` for ones that cannot be.
     """
 
     def __init__(self, *, name: str = "pbd", kind: Kind = "reference", cfl: float | None = None, particles: str | int = "teacher",

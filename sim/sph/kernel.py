@@ -109,7 +109,7 @@ SHARE, SLOPE, NORMAL, TANGENT, DRAG, SPREAD, STRETCH = range(7)
 
 
 def viscous_weight(r: np.ndarray) -> np.ndarray:
-    """f(r) = (1 - r)^(3/2), by which viscosity weighs a pair, in place of the |W'| / r of Monaghan (2005, eq. 8.11).
+    """f(r) = (1 - r)^(3/2) at distances r [...], by which viscosity weighs a pair, in place of the |W'| / r of Monaghan (2005, eq. 8.11).
 
     Any weight gives nu times the Laplacian if particles are many. Of few on a lattice |W'| / r is too steep: with a support of two
     spacings it makes shear along the lattice 0.54 and at 45 degrees 1.34 times as viscous as asked for; this one 0.97 and 1.03 (2.5

@@ -393,6 +393,7 @@ class SPHSimulator:
 
     A scene's ``time_step`` holds unless ``cfl`` is given. ``unguarded_step`` [s] is for ``sim.stability`` alone: a fixed step that nothing
     refuses or shortens, pressures that did not converge included, to see where the solver really becomes unstable.
+    Raises ``InputError`` for overrides that cannot be.
     """
 
     def __init__(self, *, name: str = "sph", kind: Kind = "reference", cfl: float | None = None, particles: str | int = "teacher",

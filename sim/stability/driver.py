@@ -57,6 +57,7 @@ class Run:
 
     @property
     def ok(self) -> bool:
+        """Whether it ran to its end."""
         return self.status == "ok"
 
     def growth(self, scale: float) -> float:
@@ -64,6 +65,7 @@ class Run:
         return float((self.energy.max() - self.energy[0]) / scale)
 
     def energy_curve(self, scale: float) -> Series:
+        """Energy over what there is to release, less what the start has beyond it."""
         return Series(("time [s]", "energy / energy at hand"), np.concatenate([[0.0], self.time]), (self.energy - self.energy[0]) / scale + 1)
 
 

@@ -25,6 +25,7 @@ def _shaken(name: str, bodies: list[dict], frequency: float, phase: float, **cha
 
 
 def run() -> list[Cell]:
+    """A shaken box of every method."""
     return [cell for name in WATER for cell in _shake(name, "" if name == "water" else f"{name}, ")]
 
 
