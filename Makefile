@@ -26,6 +26,7 @@ resume: study ## after a kill or a power cut: make resume STUDY=demo continues w
 
 test: setup
 	@$(PY) -m ruff check .
+	@$(PY) -m mypy
 	@$(PY) -m pytest -n 2 --dist loadfile
 
 validate: setup ## the solvers against formulae and experiments, at three resolutions: docs/validation.md

@@ -172,6 +172,7 @@ class Oracle(Baseline):
         raise ValueError(f"oracle: none of its {len(self.trajectories)} trajectories has the start's history at frame {start.present}")
 
     def step(self) -> None:
+        """The true acceleration; ``SimulationError`` where the truth ends."""
         if self.frame + 1 >= len(self.truth):
             raise SimulationError("the truth ends here")
         before, now, after = self.truth[self.frame - 1 : self.frame + 2].astype(float)

@@ -63,7 +63,7 @@ SOFTENING = 1e-9 * 128**2
 MOST_WALL_PARTICLES = 10**7
 
 
-class Settings(BaseModel):
+class CConvSettings(BaseModel):
     """Options of a CConv; the defaults are the paper's."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
@@ -278,7 +278,7 @@ def _dense(inputs: int, outputs: int) -> nn.Linear:
 class Network(nn.Module):
     """F: features of particles and of the boundary to corrections in units of s."""
 
-    def __init__(self, settings: Settings, dim: int, inputs: int, boundary: int):
+    def __init__(self, settings: CConvSettings, dim: int, inputs: int, boundary: int):
         super().__init__()
         cells, first, *rest = settings.kernel**dim, *settings.channels
         self.fluid, self.dense = ContinuousConv(inputs, first, cells), _dense(inputs, first)
@@ -296,11 +296,11 @@ class Network(nn.Module):
 class CConv(nn.Module):
     """The learned simulator (``learn.model.LearnedModel``); the equations are at the head of this file."""
 
-    Settings: ClassVar[type[BaseModel]] = Settings
+    Settings: ClassVar[type[BaseModel]] = CConvSettings
     kind: ClassVar[str] = "learned"
     name = "cconv"
 
-    def __init__(self, settings: Settings, spec: DataSpec):
+    def __init__(self, settings: CConvSettings, spec: DataSpec):
         super().__init__()
         self.options, self.settings, self.spec = settings, settings.model_dump(mode="json"), spec
         self.history = spec.stride + 1
@@ -323,7 +323,7 @@ class CConv(nn.Module):
         self.context = 0 if spec.context_mean is None else len(spec.context_mean)
         if self.context:
             constant("context_mean", spec.context_mean)
-            constant("context_std", np.maximum(spec.context_std, SMALLEST_STD))
+            constant("context_std", np.maximum(spec.context_std or (), SMALLEST_STD))
         kinds = len(moving) if len(moving) > 1 else 0
         self.network = Network(settings, spec.dim, 1 + spec.dim + kinds + self.context, spec.dim + self.kinematic)
 
@@ -407,7 +407,7 @@ class CConv(nn.Module):
         total = state.new_zeros(())
         for call in range(calls):
             truth = windows.position[2 + call]
-            context = windows.context[1 + call][windows.example] if self.context else None
+            context = None if windows.context is None else windows.context[1 + call][windows.example]
             predicted, neighbours = self.call(state, truth, windows.particle_type, windows.example, self.walls, context)
             square = ((predicted - truth) / self.scale).square().sum(1)
             error = (square + SOFTENING) ** (self.options.exponent / 2) * torch.exp(-neighbours / self.crowd)
@@ -426,14 +426,14 @@ class CConv(nn.Module):
         self._state = torch.from_numpy(frames).to(device)
         self._kind = torch.from_numpy(start.particle_type.astype(np.int64)).to(device)
         self._walls = Walls(start.bounds, self.spec.spacing, self.radius, start.period)
-        self._start, self._present, self._first_pairs = start, start.present, None
+        self._start, self._present, self._first_pairs = start, start.present, 0
 
     @torch.inference_mode()
     def advance(self) -> np.ndarray:
         """The next ``stride`` frames, linear between model frames. Raises ``SimulationError`` when the particles clump."""
         start, stride, (_, now) = self._start, self.spec.stride, self._state
         context, known, following = None, None, now
-        if self.context:
+        if start.context is not None:
             row = torch.as_tensor(start.context[min(self._present, len(start.context) - 1)], device=now.device)
             context = row.expand(len(now), -1)
         if start.kinematic is not None:
@@ -487,7 +487,7 @@ def load_published(path: str | Path, spacing: float = 0.05, frame_step: float = 
     channels = [kernel[4]] + [shape(f"conv{k}.kernel", 5)[4] for k in range(1, count)]
     if len(set(kernel[:3])) != 1 or kernel[3] != 4:
         raise InputError(path, "conv0_fluid.kernel", list(kernel), "must have cubic filters and 4 input channels, 1 and the velocity")
-    gravity = tuple(weights["gravity"].double().flatten().tolist()) if "gravity" in weights else None
+    gravity = tuple(weights["gravity"].double().flatten().tolist()) if "gravity" in weights else ()
     try:
         spec = DataSpec(
             dim=3, bounds=((0.0, 1.0),) * 3, radius=2.25 * spacing, spacing=spacing, frame_step=frame_step, stride=1, gravity=gravity,
@@ -495,7 +495,7 @@ def load_published(path: str | Path, spacing: float = 0.05, frame_step: float = 
             # Scales of its input and output: 1 m / s and 1 / 128 m.
             velocity_std=(frame_step,) * 3, acceleration_std=(1 / 128,) * 3,
         )
-        model = CConv(Settings(channels=tuple(channels), kernel=kernel[0]), spec)
+        model = CConv(CConvSettings(channels=tuple(channels), kernel=kernel[0]), spec)
     except ValueError as error:
         raise InputError(path, "state_dict", str(error), remedy) from None
     names = {"conv0_fluid": "fluid", "conv0_obstacle": "boundary", "dense0_fluid": "dense"}

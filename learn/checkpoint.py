@@ -11,7 +11,7 @@ import io
 import json
 import warnings
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeVar
@@ -85,7 +85,7 @@ def read_content(path: str | Path, device: torch.device | str, form: str, remedy
         raise InputError(path, "file", reason, f"damaged, or not a {form} file; {remedy}") from None
 
 
-def _read(path: str | Path, form: str, keys: dict[str, type], device: torch.device | str, remedy: str) -> dict:
+def _read(path: str | Path, form: str, keys: Mapping[str, type], device: torch.device | str, remedy: str) -> dict:
     """The content of a file of format ``form``, checked to have ``keys`` of these types and no other."""
     content = read_content(path, device, form, remedy)
     if not isinstance(content, dict) or content.get("format") != form:
@@ -169,7 +169,7 @@ def load_model(path: str | Path, device: torch.device | str = "cpu") -> nn.Modul
 
 
 def load_weights(model: nn.Module, weights: dict, where: object) -> None:
-    """Copy ``weights`` (on the CPU) into ``model``; names, shapes and types must fit exactly and every number be finite."""
+    """Copy ``weights`` (on the CPU) into ``model``; names, shapes and types must fit exactly and every number be finite, or ``InputError``."""
     own = model.state_dict()
     if set(weights) != set(own):
         raise InputError(where, "state_dict", sorted(set(map(str, weights)) ^ set(own))[:5], "names of weights do not fit the model's settings")

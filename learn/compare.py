@@ -16,7 +16,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -66,15 +66,15 @@ def _single_steps(contender: Simulator, trajectory: Trajectory, settings: Compar
     if contender.kind in _FROM_SCENE:
         return dict.fromkeys(names)
     times = np.unique(np.linspace(history - 1, len(trajectory.position) - 2, settings.one_step_samples).round().astype(int))
-    predicted = []
+    steps = []
     for present in times:
         try:
             contender.begin(start_from(trajectory, history, int(present)))
-            predicted.append(contender.advance()[0])
+            steps.append(contender.advance()[0])
         except SimulationError:
             return dict.fromkeys(names, math.nan)
     true, moving = trajectory.position[times + 1], trajectory.moving
-    predicted = periodic.beside(np.stack(predicted), true, trajectory.period)
+    predicted = periodic.beside(np.stack(steps), true, trajectory.period)
     return dict(zip(names, (metrics.one_step_mse(predicted, true), metrics.one_step_mse(predicted[:, moving], true[:, moving])), strict=True))
 
 
@@ -107,10 +107,12 @@ def _measure(contender: Simulator, trajectory: Trajectory, settings: CompareSett
 def _context_numbers(trajectory: Trajectory) -> dict[str, float]:
     """Numbers that the scene's ``context`` names, the same in every frame: name -> value. They are the last columns."""
     names = trajectory.scene.get("context") or []
-    return dict(zip(names, trajectory.context[0, -len(names) :].tolist(), strict=True)) if names else {}
+    if not names or trajectory.context is None:
+        return {}
+    return dict(zip(names, trajectory.context[0, -len(names) :].tolist(), strict=True))
 
 
-def plain(value: object) -> object:
+def plain(value: object) -> Any:
     """JSON-able: numpy to Python, non-finite numbers to None."""
     if isinstance(value, dict):
         return {str(key): plain(inner) for key, inner in value.items()}
@@ -123,7 +125,7 @@ def plain(value: object) -> object:
 
 def _aggregate(runs: list[dict], reduce) -> dict:
     """Reduce every figure over runs. Undefined runs are left out, a failed one counts as infinitely bad: it must not flatter a median."""
-    result = {}
+    result: dict = {}
     for key, first in runs[0].items():
         if isinstance(first, dict):
             result[key] = _aggregate([run[key] for run in runs], reduce)
@@ -202,9 +204,9 @@ def compare(contenders: Sequence[Simulator], trajectories: Sequence[Trajectory],
             raise InputError(f"trajectory of seed {trajectory.seed}", "frames", len(trajectory.position), remedy)
         if not trajectory.moving.any():
             raise InputError(f"trajectory of seed {trajectory.seed}", "particle_type", KINEMATIC_TYPE, "nothing in it moves; give another one")
-        if not isinstance(name := trajectory.scene.get("name"), str):
-            raise InputError(f"trajectory of seed {trajectory.seed}", "scene.name", name, "needs a name, which tells the rows of scenes apart")
-        scenes.setdefault(name, []).append(trajectory)
+        if not isinstance(called := trajectory.scene.get("name"), str):
+            raise InputError(f"trajectory of seed {trajectory.seed}", "scene.name", called, "needs a name, which tells the rows of scenes apart")
+        scenes.setdefault(called, []).append(trajectory)
     rows = []
     for scene, tests in scenes.items():
         for group in groups.values():
@@ -302,9 +304,9 @@ def attach_timing(rows: list[dict], timings: Iterable[Timing], scene: str) -> li
     for row in rows:
         timing = known.get(row["contender"])
         if row["scene"] == scene and timing is not None and timing.per_frame:
-            low, high = min(timing.per_frame), max(timing.per_frame)
+            low, high, median = min(timing.per_frame), max(timing.per_frame), float(np.median(timing.per_frame))
             row = row | {
-                "seconds_per_frame": timing.seconds_per_frame, "seconds_per_simulated_second": timing.seconds_per_frame / timing.frame_step,
+                "seconds_per_frame": median, "seconds_per_simulated_second": median / timing.frame_step,
                 "compile_seconds": timing.compile_seconds, "timing_spread": {"seconds_per_frame": [low, high], "n": len(timing.per_frame)},
                 "timing": f"interleaved, median of {len(timing.per_frame)} warm runs of {timing.frames} frames",
             }
@@ -366,8 +368,15 @@ class Yardstick:
     over: Literal["median", "mean"] = "median"  # of the trajectories
 
     def of(self, row: dict) -> float | None:
+        """The figure of a row, None where it is undefined or failed."""
         value = (row["mean"] if self.over == "mean" else row)[self.metric]
         return value.get(self.at) if isinstance(value, dict) else value
+
+    def known(self, row: dict) -> float:
+        """``of`` a row that has it."""
+        value = self.of(row)
+        assert value is not None
+        return value
 
     def __str__(self) -> str:
         name = self.metric.removesuffix("_moving").replace("_", " ").replace("mse", "MSE").replace("emd", "EMD")
@@ -386,7 +395,7 @@ class Yardstick:
 MOVING_MSE = Yardstick()
 
 
-def _comparable(rows: list[dict], row: dict, kinds: Sequence[str]) -> list[dict]:
+def _comparable(rows: Sequence[dict], row: dict, kinds: Sequence[str]) -> list[dict]:
     return [other for other in rows if other["kind"] in kinds and other["scene"] == row["scene"] and other["reference"] == row["reference"]]
 
 
@@ -398,7 +407,7 @@ def _rungs(rows: list[dict], model: dict, yardstick: Yardstick) -> list[dict]:
     ]
 
 
-def _floor(rows: list[dict], row: dict) -> dict | None:
+def _floor(rows: Sequence[dict], row: dict) -> dict | None:
     floors = _comparable(rows, row, ("floor",))
     return floors[0] if floors else None
 
@@ -428,7 +437,7 @@ def speed_up_at_equal_error(rows: list[dict], model: dict, yardstick: Yardstick 
         return nothing | {"outcome": "failed"}
     floor = _floor(rows, model)
     allowed = max(error, (yardstick.of(floor) or 0.0) if floor else 0.0)
-    enough = [row for row in _rungs(rows, model, yardstick) if yardstick.of(row) <= allowed]
+    enough = [row for row in _rungs(rows, model, yardstick) if yardstick.known(row) <= allowed]
     if not enough:
         return nothing | {"outcome": "no rung"}
     rung = min(enough, key=lambda row: row["seconds_per_frame"])
@@ -454,8 +463,8 @@ def error_at_equal_time(rows: list[dict], model: dict, yardstick: Yardstick = MO
     cheap = [row for row in _rungs(rows, model, yardstick) if seconds is not None and row["seconds_per_frame"] <= seconds]
     if not cheap:
         return {"rung": None, "error": None, "ratio": None}
-    rung = min(cheap, key=yardstick.of)
-    best = yardstick.of(rung)
+    rung = min(cheap, key=yardstick.known)
+    best = yardstick.known(rung)
     return {"rung": rung["contender"], "error": best, "ratio": error / best if error is not None and best > 0 else None}
 
 
@@ -465,17 +474,18 @@ def break_even(cost_seconds: float, solver_seconds: float, model_seconds: float)
     return cost_seconds / saved if saved > 0 else "never"
 
 
-def pareto_front(rows: list[dict], yardstick: Yardstick = MOVING_MSE) -> list[dict]:
+def pareto_front(rows: Sequence[dict], yardstick: Yardstick = MOVING_MSE) -> list[dict]:
     """Solver rungs and learned models that no other one beats in both time and error, by time; failed ones are never on it. One scene."""
     usable = [
         row for row in rows
         if row["kind"] in (*SOLVERS, "learned") and row["failures"] == 0 and yardstick.of(row) is not None and row["seconds_per_frame"] is not None
     ]
-    front, best = [], math.inf
-    for row in sorted(usable, key=lambda row: (row["seconds_per_frame"], yardstick.of(row))):
-        if yardstick.of(row) < best:
+    front: list[dict] = []
+    best = math.inf
+    for row in sorted(usable, key=lambda row: (row["seconds_per_frame"], yardstick.known(row))):
+        if yardstick.known(row) < best:
             front.append(row)
-            best = yardstick.of(row)
+            best = yardstick.known(row)
     return front
 
 
@@ -494,7 +504,7 @@ def median_trajectory(rows: list[dict], contender: str, yardstick: Yardstick = M
     return sorted(range(len(errors)), key=errors.__getitem__)[(len(errors) - 1) // 2]
 
 
-def over_floor(rows: list[dict], row: dict, metric: str = "rollout_mse_moving") -> dict[str, float | None]:
+def over_floor(rows: Sequence[dict], row: dict, metric: str = "rollout_mse_moving") -> dict[str, float | None]:
     """Error over chaos floor per horizon: near 1 the rest is chance. None where there is no floor or it is zero."""
     floor = _floor(rows, row)
     values = floor[metric] if floor else {}

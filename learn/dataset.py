@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -106,7 +107,7 @@ class DataSpec:
         if self.context_mean is not None:
             check(numbers(self.context_mean), "context_mean", "must be finite numbers")
             check(numbers(self.context_std, len(self.context_mean)), "context_std", "must match context_mean")
-            check(min(self.context_std, default=0) >= 0, "context_std", "must not be negative")
+            check(min(self.context_std or (), default=0) >= 0, "context_std", "must not be negative")
         axes = periodic.AXES[: self.dim]
         sorted_ = isinstance(self.periodic, tuple) and self.periodic == tuple(axis for axis in axes if axis in self.periodic)
         check(sorted_, "periodic", f"must be axes among {', '.join(axes)}, in this order")
@@ -114,7 +115,7 @@ class DataSpec:
     @property
     def period(self) -> np.ndarray | None:
         """[dim]: see ``sim.periodic``."""
-        return periodic.period({"periodic": self.periodic}, self.bounds)
+        return periodic.period({"periodic": self.periodic}, np.array(self.bounds))
 
     def to_dict(self) -> dict:
         """JSON-able, without the periodic axes where there are none; ``from_dict`` inverts it exactly."""
@@ -151,6 +152,7 @@ class Windows:
 
     @property
     def examples(self) -> int:
+        """Graphs in the batch."""
         return int(self.example[-1]) + 1
 
     def to(self, device: torch.device | str) -> Windows:
@@ -242,14 +244,15 @@ class Dataset:
 
     def _check_alike(self) -> None:
         """One model, one box: what ``DataSpec`` holds once must be the same in all trajectories."""
-        first = None
+        first: dict[str, Any] | None = None
         for index, reader in self.entries:
             meta, dim = reader.meta(index), reader.shape(index)[2]
             try:
                 scene = meta["scene"]
-                values = {"dim": dim, "radius": float(meta["radius"]), "frame_step": float(meta["frame_step"]), "bounds": _tuple(meta["bounds"]),
-                          "spacing": float(scene["spacing"]), "gravity": tuple(float(g) for g in scene["gravity"]),
-                          "periodic": periodic.axes(scene)}
+                values: dict[str, Any] = {
+                    "dim": dim, "radius": float(meta["radius"]), "frame_step": float(meta["frame_step"]), "bounds": _tuple(meta["bounds"]),
+                    "spacing": float(scene["spacing"]), "gravity": tuple(float(g) for g in scene["gravity"]), "periodic": periodic.axes(scene),
+                }
                 if len(values["gravity"]) != dim:
                     raise ValueError(f"gravity has {len(values['gravity'])} entries")
             except (KeyError, TypeError, ValueError) as error:
@@ -260,7 +263,8 @@ class Dataset:
                 if value != first[name]:
                     remedy = f"the first trajectory of the split has {first[name]}; one data set, one {name}"
                     raise InputError(reader.path, f"{index:06d}/{name}", value, remedy)
-        self.common, self.period = first, periodic.period(first, first["bounds"])
+        assert first is not None  # there is a trajectory
+        self.common, self.period = first, periodic.period(first, np.array(first["bounds"]))
 
     def __len__(self) -> int:
         return len(self.entries)
@@ -365,15 +369,14 @@ class Dataset:
             raise InputError(self.path, "context", sorted(map(str, widths)), "must be of one width in all trajectories; generate the data set again")
         context_mean = context_std = None
         if widths != {None}:
-            moments = _Moments(widths.pop())
-            for context in contexts:
+            present = [context for context in contexts if context is not None]
+            moments = _Moments(present[0].shape[1])
+            for context in present:
                 moments.add(context)
             context_mean, context_std = moments.mean.tolist(), moments.std.tolist()
         try:
-            return DataSpec(
-                **train.common, stride=stride, particle_types=tuple(sorted(kinds)),
-                context_mean=context_mean, context_std=context_std, **statistics,
-            )
+            found = train.common | statistics | {"context_mean": context_mean, "context_std": context_std}
+            return DataSpec(stride=stride, particle_types=tuple(sorted(kinds)), **found)
         except ValueError as error:
             raise InputError(self.path, "statistics", str(error), "generate the data set again") from None
 
@@ -437,12 +440,12 @@ class Dataset:
                     block[..., axis] = np.float32(sum(self.common["bounds"][axis])) - block[..., axis]
             blocks.append(block)
             kinds.append(self.particle_type(number))
-            context = self.context(number)
-            contexts.append(None if context is None else context[frame])
+            if (context := self.context(number)) is not None:
+                contexts.append(context[frame])
         example = np.repeat(np.arange(len(blocks)), [len(kind) for kind in kinds])
         return Windows(
             position=torch.from_numpy(np.concatenate(blocks, axis=1)), particle_type=torch.from_numpy(np.concatenate(kinds)),
-            example=torch.from_numpy(example), context=None if contexts[0] is None else torch.from_numpy(np.stack(contexts, axis=1)),
+            example=torch.from_numpy(example), context=torch.from_numpy(np.stack(contexts, axis=1)) if contexts else None,
         )
 
 
@@ -453,7 +456,7 @@ class Sampler:
     windows left at the end are dropped. A new window length (a model may lengthen its unrolling as training goes) begins a new epoch.
 
     A batch has ``batch`` windows, or those of at most so many ``edges``, estimated as particles times the data's mean neighbours; one at least for
-    each of ``processes``, of which it then holds this one's share.
+    each of ``processes``, of which it then holds this one's share. Raises ``InputError`` for data that cannot be drawn from so.
     """
 
     def __init__(self, dataset: Dataset, settings: DataSettings, batch: int | None, seed: int, edges: int | None = None,
@@ -471,7 +474,8 @@ class Sampler:
         if settings.mirror and dataset.context(0) is not None:
             raise InputError(dataset.path, "data.mirror", True, "a context cannot be mirrored; switch mirror off")
         self.epoch, self.offset, self.frames = -1, 0, 0
-        self._rows = self._order = self._mirror = None
+        self._rows, self._order = np.zeros((0, 2), int), np.zeros(0, int)
+        self._mirror: np.ndarray | None = None
 
     def _shuffle(self) -> None:
         generator = np.random.default_rng([self.seed, self.epoch])
@@ -490,6 +494,7 @@ class Sampler:
         if self.size is not None:
             pick = self._order[self.offset : self.offset + self.size]
             return pick if len(pick) == self.size else pick[:0]
+        assert self.edges is not None  # where there is no size
         edges = self._edges[self._rows[self._order[self.offset : self.offset + 1 + int(self.edges / self._edges.min()) + self.least], 0]].cumsum()
         count = max(int(np.searchsorted(edges, self.edges, side="right")), self.least)
         return self._order[self.offset : self.offset + count] if count < len(edges) else self._order[:0]
@@ -507,7 +512,7 @@ class Sampler:
             pick = pick if len(pick) else self._order
         self.offset += len(pick)
         rows, mirror = self._rows[pick], None if self._mirror is None else self._mirror[pick]
-        if self.least == 1:
+        if self.processes is None or self.least == 1:
             return self.dataset.batch(rows, frames, self.settings.stride, mirror)
         mine, counts = self.processes.share(rows), [self.dataset.shapes[number][1] for number in rows[:, 0]]
         windows = self.dataset.batch(rows[mine], frames, self.settings.stride, None if mirror is None else mirror[mine])

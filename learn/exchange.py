@@ -28,7 +28,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
@@ -110,8 +110,8 @@ def import_model(
     Metadata written by ``export_model`` hold all of them. Runs no code from the file; every fault of what is given is an ``InputError``.
     """
     path = Path(path)
-    known = read_metadata(metadata, edges=edges, noise_std=noise_std, spacing=spacing, gravity=gravity, particle_types=particle_types)
-    weights = read_content(path, "cpu", "geoelements/gns model", "copy the file again")
+    known: Any = read_metadata(metadata, edges=edges, noise_std=noise_std, spacing=spacing, gravity=gravity, particle_types=particle_types)
+    weights: Any = read_content(path, "cpu", "geoelements/gns model", "copy the file again")
     settings, context = _sizes(weights, known.dim, path)
     settings |= {"noise": known.noise_std, "noise_unit": "absolute", "edge_update": known.edges == "updated"}
     if known.boundary_augment != 1:
@@ -154,7 +154,7 @@ def export_model(model: GNS, out: str | Path) -> dict:
     if spec.periodic:
         raise InputError("model", "periodic", list(spec.periodic), "geoelements/gns knows walls all around only")
     if len(spec.context_mean or ()) > 1:
-        raise InputError("model", "context", len(spec.context_mean), "geoelements/gns knows one number only, a material property")
+        raise InputError("model", "context", len(spec.context_mean or ()), "geoelements/gns knows one number only, a material property")
     weights = port_weights(model)
     metadata = {
         "dim": spec.dim, "bounds": spec.bounds, "default_connectivity_radius": model.radius, "dt": spec.frame_step, "sequence_length": None,
@@ -177,7 +177,7 @@ def export_model(model: GNS, out: str | Path) -> dict:
 
 
 def port_weights(model: GNS) -> dict[str, Tensor]:
-    """The model as a state_dict of the port, float32, in the port's order."""
+    """The model as a state_dict of the port, float32, in the port's order: name -> [outputs, inputs] or [outputs]."""
     own = {name: value.detach().cpu().double() for name, value in model.state_dict().items()}
     features, port = model.features, {}
     port[_EMBEDDING] = own["features.embedding.weight"] if features.embedding else torch.zeros(TYPE_SLOTS, TYPE_WIDTH, dtype=torch.float64)

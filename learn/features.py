@@ -34,7 +34,7 @@ NoiseScheme = Literal["random_walk", "uncorrelated", "correlated", "last"]
 def random_walk_noise(
     position: Tensor, sigma: float | Tensor, generator: torch.Generator, moving: Tensor | None = None, place: tuple[int, int] | None = None
 ) -> Tensor:
-    """``velocity_noise`` as the paper has it."""
+    """``velocity_noise`` as the paper has it, [frames, particles, dim]."""
     return velocity_noise("random_walk", position, sigma, generator, moving, place)
 
 
@@ -105,7 +105,7 @@ class Features(nn.Module):
         constant("acceleration_mean", spec.acceleration_mean)
         constant("acceleration_std", inflated(spec.acceleration_std))
         constant("acceleration_base", base)
-        constant("bounds", periodic.walls(spec.bounds, spec.period).tolist())
+        constant("bounds", periodic.walls(np.array(spec.bounds), spec.period).tolist())
         self.walled = [axis for axis, name in enumerate(periodic.AXES[: spec.dim]) if name not in spec.periodic]
         self.period = spec.period
         self.embedding = nn.Embedding(TYPE_SLOTS, TYPE_WIDTH) if len(spec.particle_types) > 1 else None
@@ -113,10 +113,10 @@ class Features(nn.Module):
         self.context = spec.context_mean is not None
         if self.context:
             constant("context_mean", spec.context_mean)
-            constant("context_std", [max(s, SMALLEST_STD) for s in spec.context_std])
+            constant("context_std", [max(s, SMALLEST_STD) for s in spec.context_std or ()])
         shown = 1 if scaling == "last" else velocities
         self.node_width = shown * spec.dim + 2 * len(self.walled) + (TYPE_WIDTH if self.embedding else 0)
-        self.node_width += (len(spec.context_mean) if self.context else 0) + (spec.dim if absolute else 0)
+        self.node_width += len(spec.context_mean or ()) + (spec.dim if absolute else 0)
         self.edge_width = 0 if absolute else spec.dim + 1 + (spec.dim if relative_velocity else 0)
 
     def moving(self, particle_type: Tensor) -> Tensor | None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 
@@ -58,9 +58,9 @@ def _one_scene(rows: Sequence[dict]) -> str:
     return scenes[0]
 
 
-def _shades(rows: Sequence[dict]) -> list[tuple[tuple[float, float, float], object]]:
+def _shades(rows: Sequence[dict]) -> list[tuple[tuple[float, ...], object]]:
     """(colour, dash) of every row: the colour of its kind, lightened and dashed along the contenders of that kind."""
-    result = []
+    result: list[tuple[tuple[float, ...], object]] = []
     for row in rows:
         kin = [other["contender"] for other in rows if other["kind"] == row["kind"]]
         rank = kin.index(row["contender"])
@@ -85,9 +85,9 @@ def _place_labels(axes: Axes, points: Sequence[tuple[float, float]], labels: Seq
     for line in lines:
         for one, other in pairwise(axes.transData.transform(line)):
             strokes.append(np.linspace(one, other, max(int(math.dist(one, other) / (4 * size)), 1) + 1))
-    strokes = np.concatenate(strokes)
+    stroke = np.concatenate(strokes)
     # Taken boxes, [n, 4]: left, low, right, high.
-    taken = np.concatenate([np.hstack([pixels - 7 * size, pixels + 7 * size]), np.hstack([strokes - size, strokes + size])])
+    taken = np.concatenate([np.hstack([pixels - 7 * size, pixels + 7 * size]), np.hstack([stroke - size, stroke + size])])
     directions = np.array([(math.cos(angle), math.sin(angle)) for _, angle in _PLACES])
     radii = np.array([radius for radius, _ in _PLACES])
     distances = np.linalg.norm(pixels[:, None] - pixels, axis=2)
@@ -120,15 +120,15 @@ def error_over_run_time(rows: Sequence[dict], path: str | Path, yardstick: Yards
     shown = [row for row in rows if row["kind"] not in ("floor", "oracle")]
     drawn = [row for row in shown if yardstick.of(row) is not None and row["seconds_per_frame"]]
     left_out = [f"{row['contender']} ({row['status']})" for row in shown if not any(row is other for other in drawn)]
-    floors = [yardstick.of(row) for row in rows if row["kind"] == "floor" and yardstick.of(row)]
-    positive = [yardstick.of(row) for row in drawn if yardstick.of(row) > 0]
+    floors = [yardstick.known(row) for row in rows if row["kind"] == "floor" and yardstick.of(row)]
+    positive = [yardstick.known(row) for row in drawn if yardstick.known(row) > 0]
     low = 10 ** (math.floor(math.log10(min(positive))) - 1) if positive else 1e-9
     ground = 2 * low  # where an error of zero is drawn
     lines = []
     with plt.rc_context(_STYLE):
         figure, axes = plt.subplots(figsize=(8.5, 5.6), layout="constrained")
         axes.set(xscale="log", yscale="log", xlabel="run time, seconds per frame", ylabel=str(yardstick), title=f"{scene}: error over run time")
-        points = [(row["seconds_per_frame"], max(yardstick.of(row), ground)) for row in drawn]
+        points = [(row["seconds_per_frame"], max(yardstick.known(row), ground)) for row in drawn]
         for row, (x, y) in zip(drawn, points, strict=True):
             colour = COLOURS[row["kind"]]
             worst, least = yardstick.of(row["spread"]["max"]), yardstick.of(row["spread"]["min"])
@@ -140,7 +140,7 @@ def error_over_run_time(rows: Sequence[dict], path: str | Path, yardstick: Yards
                 axes.plot(*lines[-1].T, color=colour, lw=1, alpha=0.45, zorder=2)
             hollow = {"markerfacecolor": "white"} if row["failures"] else {}
             axes.plot(x, y, MARKERS[row["kind"]], color=colour, markersize=13 if row["kind"] == "reference" else 8, zorder=4, clip_on=False, **hollow)
-        front = [(row["seconds_per_frame"], max(yardstick.of(row), ground)) for row in pareto_front(list(rows), yardstick)]
+        front = [(row["seconds_per_frame"], max(yardstick.known(row), ground)) for row in pareto_front(list(rows), yardstick)]
         if len(front) > 1:
             lines.append(np.array(front))
             axes.plot(*lines[-1].T, color="#444444", lw=1.2, ls=(0, (4, 2)), zorder=1)
@@ -300,7 +300,7 @@ def ablation(rows: Sequence[dict], axes: dict[str, dict[str, str | float]], path
         _save(figure, path)
 
 
-def generalisation(rows: Sequence[dict], over: str, trained: dict[str, Sequence[tuple[float, float]]], path: str | Path) -> None:
+def generalisation(rows: Sequence[dict], over: str, trained: Mapping[str, Sequence[tuple[float, float]]], path: str | Path) -> None:
     """Rollout error beyond the training, a column a learned contender: above as it is, below over that of the trajectory's best trivial baseline.
     A dot a rollout; a bar the median of a scene, or of what lies between the ends of what was trained on, which is shaded; a cross at the top a
     rollout that failed. Over particles, where scenes may lie above each other, every scene has a marker.
@@ -325,12 +325,12 @@ def generalisation(rows: Sequence[dict], over: str, trained: dict[str, Sequence[
                 for scene in scenes:
                     members = [trial for trial in found if trial.scene == scene]
                     _dots(panel, members, key, COLOURS[kind], shapes.get(scene, MARKERS[kind]))
-            floors = [trial for trial in found if trial.floor]
+            floors = [trial.floor for trial in found if trial.floor]
             lowest = min([trial.error for trial in found if trial.error > 0], default=0.0)
-            if floors and max(trial.floor for trial in floors) > lowest / 10:
-                _dots(above, floors, "floor", COLOURS["floor"], MARKERS["floor"])
+            if floors and max(floors) > lowest / 10:
+                _dots(above, [trial for trial in found if trial.floor], "floor", COLOURS["floor"], MARKERS["floor"])
             elif floors:
-                notes.append(f"Chaos floor of {model} below the axis: at most {max(trial.floor for trial in floors):.1e}.")
+                notes.append(f"Chaos floor of {model} below the axis: at most {max(floors):.1e}.")
             below.axhline(1, color=COLOURS["trivial"], lw=1.2, ls=(0, (4, 2)))
             for group in groups(found, over, ranges):
                 ends = _ends([trial.value for trial in group.trials], over)
@@ -394,7 +394,7 @@ def _smooth(values: np.ndarray, count: int) -> np.ndarray:
     return np.array([np.median(values[max(0, i - count // 2) : i + count // 2 + 1]) for i in range(len(values))])
 
 
-def training_curve(runs: dict[str, str | Path], path: str | Path) -> None:
+def training_curve(runs: Mapping[str, str | Path], path: str | Path) -> None:
     """Training loss (running median over the raw values) and validation rollout MSE over training time, one colour a run.
 
     runs: label -> run folder with ``log.csv`` (step, seconds, loss) and ``validation.csv`` (step, seconds, rollout_mse). ``InputError``

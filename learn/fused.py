@@ -21,7 +21,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -343,6 +343,7 @@ class Weights:
     width: int
 
     def arguments(self) -> tuple:
+        """As the kernels take them."""
         b0, b1, b2, gamma, beta = self.vectors
         latent = len(self.second)
         first = TensorDescriptor.from_tensor(self.first, [latent, self.width])
@@ -368,10 +369,12 @@ class Shadow:
             self._sources += sources
             self._copies += copies
             vectors = (*(linear.bias for linear in mlp.linears), mlp.norm.weight, mlp.norm.bias)
-            self._of[mlp] = Weights(first, *others, vectors, width)
+            second, third = others
+            self._of[mlp] = Weights(first, second, third, vectors, width)
 
     @torch.no_grad()
     def refresh(self) -> None:
+        """Copy the network's weights as they are now."""
         torch._foreach_copy_(self._copies, self._sources)
 
     def __getitem__(self, mlp: MLP) -> Weights:
@@ -391,12 +394,12 @@ def _tiled(values: Tensor, tile: int) -> TensorDescriptor:
 
 
 def _run_forward(kind: str, weights: Weights, x: Tensor, out: Tensor | None, count: Tensor, *, keep: bool, x2: Tensor | None = None,
-                 table: Tensor | None = None, graph: PaddedGraph | None = None, message: Tensor | None = None) -> _Kept | None:
+                 table: Tensor | None = None, graph: Any = None, message: Tensor | None = None) -> _Kept | None:
     from learn.gns import NORM_EPSILON
 
     tile, warps = FORWARD[kind]
     latent, tiles, edge = len(weights.second), triton.cdiv(len(x), tile), kind == "edge"
-    kept = None
+    kept: Any = None
     if keep:
         kept = _Kept(x.new_empty(3, tiles * tile, latent, dtype=weights.first.dtype), x.new_empty(tiles * tile, dtype=torch.float32))
     given, none = _tiled(x, tile), x
@@ -410,7 +413,7 @@ def _run_forward(kind: str, weights: Weights, x: Tensor, out: Tensor | None, cou
 
 
 def _run_backward(kind: str, weights: Weights, x: Tensor, kept: _Kept, count: Tensor, grad_out: Tensor | None, grad_x: Tensor, *,
-                  grad_x2: Tensor | None = None, graph: PaddedGraph | None = None, grad_sums: Tensor | None = None):
+                  grad_x2: Tensor | None = None, graph: Any = None, grad_sums: Tensor | None = None):
     """Writes grad_x and grad_x2; returns the gradients after W2, W1, W0 [3, rows, latent] and those of [b0, b1, b2, gamma, beta]."""
     tile, warps = BACKWARD[kind]
     (_, padded, latent), rows, edge = kept.hidden.shape, len(x), kind == "edge"
@@ -535,6 +538,7 @@ def _each(weights: tuple[Tensor, ...], vectors: tuple[Tensor, ...]) -> tuple[Ten
 
 
 def _parameters(mlp: MLP) -> list[Tensor]:
+    assert mlp.norm is not None
     return [p for linear in mlp.linears for p in (linear.weight, linear.bias)] + [mlp.norm.weight, mlp.norm.bias]
 
 
@@ -545,8 +549,9 @@ def supports(network: Network) -> bool:
 
 
 def forward(network: Network, nodes: Tensor, edges: Tensor, graph: PaddedGraph) -> Tensor:
-    """``Network.forward`` on a ``PaddedGraph``, by the weights in ``network.shadow``."""
+    """``Network.forward`` on a ``PaddedGraph``, by the weights in ``network.shadow``: [particles, dim]."""
     shadow = network.shadow
+    assert shadow is not None
     keep = torch.is_grad_enabled()
     rows = torch.full((1,), len(nodes), dtype=torch.int32, device=nodes.device)
     dtype = shadow.dtype

@@ -28,6 +28,7 @@ class Trial:
 
     @property
     def ratio(self) -> float:
+        """Error over the best trivial baseline's."""
         return self.error / self.trivial if self.trivial > 0 else math.inf
 
 

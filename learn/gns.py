@@ -19,7 +19,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 import torch
@@ -39,13 +39,13 @@ from sim.trajectory import KINEMATIC_TYPE
 if TYPE_CHECKING:
     from learn.dataset import DataSpec, Windows
     from learn.fused import Search, Shadow
-    from learn.replay import TrainingReplay
+    from learn.replay import RolloutReplay, TrainingReplay
 
 #: Added to the variance by every LayerNorm (torch's default).
 NORM_EPSILON = 1e-5
 
 
-class Settings(BaseModel):
+class GNSSettings(BaseModel):
     """Options of a GNS; the defaults are the paper's."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
@@ -79,7 +79,7 @@ class Settings(BaseModel):
     edge_cap: float = Field(4.0, gt=1)  # a rollout fails when its edges exceed this multiple of their first number (it clumps)
 
     @model_validator(mode="after")
-    def _go_together(self) -> Settings:
+    def _go_together(self) -> GNSSettings:
         if self.walls and not self.ballistic:
             raise ValueError("walls stops the ballistic flight; set ballistic: true with it")
         if self.flight_below and not self.ballistic:
@@ -107,6 +107,7 @@ class MLP(nn.Module):
 
     def rest(self) -> list[Tensor]:
         """Weight, bias of every layer but the first, then LayerNorm's weight and bias."""
+        assert self.norm is not None
         return [p for linear in self.linears[1:] for p in (linear.weight, linear.bias)] + [self.norm.weight, self.norm.bias]
 
     def tiled(self, dtype: torch.dtype) -> bool:
@@ -116,6 +117,7 @@ class MLP(nn.Module):
 
     def tiles(self, inputs: list[Tensor], dtype: torch.dtype, out: Tensor, residual: bool = False) -> Tensor:
         """``tiles.mlp`` of this."""
+        assert self.norm is not None
         norm = (self.norm.weight, self.norm.bias, NORM_EPSILON)
         return tiles.mlp(inputs, [(linear.weight, linear.bias) for linear in self.linears], norm, dtype, out, residual)
 
@@ -173,7 +175,7 @@ def _edge_pass(graph: Graph, dtype: torch.dtype, table: Tensor, edges: Tensor, f
         x = x if x.device.type == "cpu" else x.to(gamma.dtype)  # the CPU's kernel takes bf16 with weights in f32, and is spared a copy
         message, mean[kept], rstd[kept] = torch.native_layer_norm(x, (latent,), gamma, beta, NORM_EPSILON)
         sums[run.receivers] = _bag_sum(message, run.order, run.offsets)
-        if update:
+        if updated is not None:
             torch.add(edges[run.edges], message.to(dtype), out=updated[run.edges])
     return sums, updated, (*hidden, z, mean, rstd)
 
@@ -263,7 +265,7 @@ class Interaction(nn.Module):
 class Network(nn.Module):
     """Encode, process, decode: node and edge features to the normalised acceleration."""
 
-    def __init__(self, settings: Settings, node_width: int, edge_width: int, dim: int):
+    def __init__(self, settings: GNSSettings, node_width: int, edge_width: int, dim: int):
         super().__init__()
         latent, hidden = settings.latent, settings.hidden_layers
         self.encode_node = MLP(node_width, latent, hidden, latent)
@@ -275,8 +277,8 @@ class Network(nn.Module):
         self.low_precision = settings.precision == "bf16"
         self.shadow: Shadow | None = None  # what fused kernels read, while it is they that run
 
-    def forward(self, nodes: Tensor, edges: Tensor, graph: Graph) -> Tensor:
-        """nodes [particles, node_width], edges [edges, edge_width] -> [particles, dim]."""
+    def forward(self, nodes: Tensor, edges: Tensor, graph: Any) -> Tensor:
+        """nodes [particles, node_width], edges [edges, edge_width] -> [particles, dim]; graph: a ``Graph``, for fused kernels a ``PaddedGraph``."""
         if self.shadow is not None:
             from learn import fused  # not above: Triton comes with CUDA builds of torch alone
 
@@ -311,15 +313,17 @@ class _State:
     @property
     def context(self) -> np.ndarray:
         """[c]: of the present frame."""
+        assert self.start.context is not None
         return self.start.context[min(self.present, len(self.start.context) - 1)]
 
-    def measure(self, edges: int) -> None:
+    def measure(self, edges: int) -> int:
         """The edges of the first graph are what later ones are measured by; without self edges there may be none."""
         self.first_edges = self.first_edges or max(edges, len(self.kinds))
+        return self.first_edges
 
     def known(self, stride: int) -> Tensor | None:
         """[stride, k, dim]: where the kinematic particles are in the next frames."""
-        if self.fixed is None:
+        if self.fixed is None or self.start.kinematic is None:
             return None
         places = self.start.kinematic[np.minimum(self.present + 1 + np.arange(stride), len(self.start.kinematic) - 1)]
         return torch.as_tensor(places, dtype=self.position.dtype, device=self.position.device)
@@ -328,11 +332,11 @@ class _State:
 class GNS(nn.Module):
     """The learned simulator: features, network, semi-implicit Euler v' = v + a, p' = p + v' with dt = 1 (``learn.model.LearnedModel``)."""
 
-    Settings: ClassVar[type[BaseModel]] = Settings
+    Settings: ClassVar[type[BaseModel]] = GNSSettings
     kind: ClassVar[str] = "learned"
     name = "gns"
 
-    def __init__(self, settings: Settings, spec: DataSpec):
+    def __init__(self, settings: GNSSettings, spec: DataSpec):
         super().__init__()
         self.options, self.settings, self.spec = settings, settings.model_dump(mode="json"), spec
         self.velocities = settings.history
@@ -403,7 +407,7 @@ class GNS(nn.Module):
         total = position.new_zeros(())
         calls = len(windows.position) - given
         for call in range(1, calls + 1):
-            context = windows.context[given + call - 2][windows.example] if self.features.context else None
+            context = None if windows.context is None else windows.context[given + call - 2][windows.example]
             graph = self._graph(position[-1], windows.example, self.features.period, present)
             output = self._predict(position, graph, windows.particle_type, self.features.bounds, context, self.features.period)
             following = windows.position[given + call - 1] + noise[-1]
@@ -444,7 +448,8 @@ class GNS(nn.Module):
                 raise ValueError(f"bounds {np.asarray(start.bounds).tolist()} beside {np.asarray(starts[0].bounds).tolist()}: one box a batch")
         device = self.features.bounds.device
         self._bounds = torch.as_tensor(starts[0].walls, device=device)
-        self._states, self._replay = [], None
+        self._states: list[_State] = []
+        self._replay: RolloutReplay | None = None
         for start in starts:
             # Positions in float64: differences of float32 positions lose the last digits of small accelerations, frame after frame.
             frames = start.history[len(start.history) - self.history :: self.spec.stride].astype(np.float64)
@@ -489,9 +494,9 @@ class GNS(nn.Module):
         failed = {}
         for number, own in zip(which, edges, strict=True):
             state = self._states[number]
-            state.measure(own)
-            if own > self.options.edge_cap * state.first_edges:
-                cap = f"{self.options.edge_cap:g} x the {state.first_edges} of the start"
+            first = state.measure(own)
+            if own > self.options.edge_cap * first:
+                cap = f"{self.options.edge_cap:g} x the {first} of the start"
                 failed[number] = SimulationError(f"particles clump: {own} edges, {cap} exceeded")
         return failed
 
@@ -512,7 +517,7 @@ class GNS(nn.Module):
         if failed := self._clumped(which, edges):
             return self._without(failed, which)
         self._replay.accept()
-        return frames
+        return list(frames)
 
     def _follow(self, state: _State, acceleration: Tensor) -> np.ndarray:
         """The frames up to the one that an acceleration leads to."""

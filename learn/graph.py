@@ -33,10 +33,12 @@ class Graph:
 
     @property
     def edges(self) -> int:
+        """Number of edges, self edges included."""
         return len(self.sender)
 
     @property
     def particles(self) -> int:
+        """Number of particles."""
         return len(self.offsets) - 1
 
     @cached_property

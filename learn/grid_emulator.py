@@ -132,6 +132,7 @@ class Residual(nn.Module):
             self.convolution.weight.mul_(0.7)
 
     def forward(self, x: Tensor, neighbours: Tensor) -> Tensor:
+        """x [nodes, channels], neighbours as of ``StencilConv``."""
         return x + self.convolution(functional.relu(x), neighbours)
 
 
@@ -182,7 +183,8 @@ class SparseGrid(nn.Module):
 
         Returns the occupied ids [A] ascending, their row by id [examples * sizes[0]], and the levels, finest first.
         """
-        ids, corner, levels = nodes.reshape(-1), None, []
+        ids, corner = nodes.reshape(-1), None
+        levels: list[Level] = []
         for level, size in enumerate(self.sizes):
             mask = torch.zeros(examples * size, dtype=torch.bool, device=ids.device)
             mask[ids] = True
@@ -234,7 +236,10 @@ class SparseUNet(nn.Module):
 
 
 class GridEmulator(nn.Module):
-    """The grid emulator as a learned model and as a simulator; the equations are at the head of this file."""
+    """The grid emulator as a learned model and as a simulator; the equations are at the head of this file.
+
+    Raises ``InputError`` for data that it is not made for (periodic boxes, grids too large).
+    """
 
     Settings = GridEmulatorSettings
     name = "grid_emulator"
@@ -283,7 +288,7 @@ class GridEmulator(nn.Module):
         self.context = 0 if spec.context_mean is None else len(spec.context_mean)
         if self.context:
             constant("context_mean", spec.context_mean)
-            constant("context_std", np.maximum(spec.context_std, 1e-8))
+            constant("context_std", np.maximum(spec.context_std or (), 1e-8))
         materials = len(self.moving)
         inputs = len(spec.particle_types) + materials * dim * (settings.history - 1) + 2 * dim + len(settings.preview) + self.context
         self.network = SparseUNet(dim, inputs, settings.channels, materials * (m * dim + 1), settings.blocks)
@@ -448,7 +453,7 @@ class GridEmulator(nn.Module):
     def advance(self) -> np.ndarray:
         """The next m * stride file frames [m * stride, particles, dim], linear between model frames."""
         stride = self.spec.stride
-        context = self._context[self._frame : self._frame + 1] if self.context else None
+        context = None if self._context is None else self._context[self._frame : self._frame + 1]
         future = self.call(self._state, self._kind, self._example, 1, context)
         if self._kinematic is not None:
             frames = self._frame + stride * torch.arange(1, len(future) + 1, device=future.device)

@@ -342,12 +342,12 @@ def cloud_metrics(p: np.ndarray, q: np.ndarray, trajectory: Trajectory, *, emd_p
         "centre_of_mass_error": centre_of_mass_error(p, q, spacing),
     }
     if period is None:
-        angles = [pile_angle(cloud, bounds, gravity, spacing) for cloud in (p, q)]
+        slope, true_slope = (pile_angle(cloud, bounds, gravity, spacing) for cloud in (p, q))
         found |= {
             "front_error": abs(front(p, gravity) - front(q, gravity)) / spacing,
             "width_ratio": ratio(width(p, gravity), width(q, gravity)),
             "height_ratio": ratio(pile_height(p, bounds, gravity), pile_height(q, bounds, gravity)),
-            "pile_angle_error": None if None in angles else abs(angles[0] - angles[1]),
+            "pile_angle_error": None if slope is None or true_slope is None else abs(slope - true_slope),
         }
     return dict.fromkeys(CLOUD_METRICS) | found
 
@@ -371,7 +371,7 @@ def evaluate(
     before = trajectory.position[present, moving]
     velocity, true_velocity = (velocities(cloud, before, trajectory.frame_step, period) for cloud in (p, q))
     escaped = escaped_fraction(p, periodic.walls(trajectory.bounds, period))
-    result = {
+    result: dict = {
         "rollout_mse": everything,
         "rollout_mse_moving": only_moving,
         "rollout_mse_per_radius2": {key: None if value is None else value / trajectory.radius**2 for key, value in everything.items()},

@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -38,7 +38,8 @@ class Replay:
     """
 
     def __init__(self, device: torch.device):
-        self.device, self.graph = device, None
+        self.device = device
+        self.graph: Any = None
 
     def __call__(self, function: Callable[[], None], prepare: Callable[[], None] = lambda: None) -> None:
         if self.device.type != "cuda":
@@ -93,9 +94,8 @@ class RolloutReplay:
             self.context = torch.zeros(len(counts), len(self.states[0].context), device=device)
         first = 0
         for state in self.states:
-            if state.first_edges is None:
-                state.measure(radius_graph(state.position[-1], model.radius, None, model.options.self_edges).edges)
-            first += state.first_edges
+            edges = state.first_edges or radius_graph(state.position[-1], model.radius, None, model.options.self_edges).edges
+            first += state.measure(edges)
         self.search = _searching(model, states[0].start.bounds, len(counts), math.ceil(model.options.edge_cap * first) + 1)
         self.shadow = Shadow(model.network)
         self.shadow.refresh()

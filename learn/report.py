@@ -282,7 +282,7 @@ def _floors(rows: Sequence[dict]) -> _Table | None:
     table = _Table("MSE over the chaos floor, moving particles", _horizon_names(horizons))
     for heading, row in _with_headings([row for row in rows if row["kind"] in ("solver", "learned", "trivial")]):
         over = over_floor(rows, row)
-        cells = [_Cell(f"{number(over[at])}×") if over.get(at) is not None else table.missing(None) for at in horizons]
+        cells = [table.missing(None) if (ratio := over.get(at)) is None else _Cell(f"{number(ratio)}×") for at in horizons]
         table.rows.append(_Row(row["contender"], cells, heading))
     return table
 
@@ -346,7 +346,7 @@ def _published(scenes: Sequence[dict]) -> _Table | None:
         if name is None:
             continue
         domain, variant = DOMAINS[name], scene["name"].removeprefix(name).lstrip("-, ")
-        heading = name.upper().replace("_", "-") + (f", {variant}" if variant else "")
+        heading: str | None = name.upper().replace("_", "-") + (f", {variant}" if variant else "")
         parameters = PARAMETERS[domain.dim]
         for row in (row for row in rows if row["kind"] == "learned"):
             cost, failed = row.get("cost") or {}, _failure(row)

@@ -94,7 +94,8 @@ def rollout_scene(
 ) -> dict:
     """Roll a checkpoint out from the first frames of ``count`` draws of a scene file, those of the test split of a data set with base seed ``seed``.
 
-    The first frames come from the scene's solver, ``frames`` (None: to the scene's end) from the model; otherwise as ``rollout_dataset``.
+    The first frames come from the scene's solver, ``frames`` (None: to the scene's end) from the model; otherwise, with
+    its ``InputError`` and ``RunError``, as ``rollout_dataset``.
     """
     out = Path(out)
     _free(out)

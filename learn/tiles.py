@@ -22,6 +22,7 @@ import shutil
 import subprocess
 import tempfile
 import warnings
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 
@@ -73,9 +74,10 @@ def build() -> ctypes.CDLL | None:
         return None
     version = subprocess.run([compiler, "--version"], capture_output=True, check=False).stdout
     key = hashlib.sha256(b"\0".join([SOURCE.read_bytes(), " ".join(FLAGS).encode(), version, _processor()])).hexdigest()[:16]
-    folder = SOURCE.parent.parent / ".kernel_cache"
+    place = SOURCE.parent.parent / ".kernel_cache"
+    folder: Path | None = place
     try:
-        folder.mkdir(exist_ok=True)
+        place.mkdir(exist_ok=True)
     except OSError:
         folder = None
     library = folder / f"tiles-{key}.so" if folder else None
@@ -114,7 +116,7 @@ def _declared(library: ctypes.CDLL) -> ctypes.CDLL:
 
 
 def supports(latent: int, layers: int, dtype: torch.dtype, weight: Tensor) -> bool:
-    """Whether the kernels take an MLP of this width, with so many layers after the first, products in ``dtype``, and this of its weights."""
+    """Whether the kernels take an MLP of this width, with so many layers after the first, products in ``dtype``, this weight [outputs, inputs]."""
     if weight.device.type != "cpu" or weight.dtype != torch.float32 or dtype not in (torch.float32, torch.bfloat16):
         return False
     if layers > MOST or latent > WIDEST or (library := build()) is None:
@@ -122,7 +124,7 @@ def supports(latent: int, layers: int, dtype: torch.dtype, weight: Tensor) -> bo
     return latent % library.width() == 0 and (dtype == torch.float32 or bool(library.multiplies_bf16()))
 
 
-def _run(name: str, dtype: torch.dtype, calls: list[ctypes.Structure]) -> None:
+def _run(name: str, dtype: torch.dtype, calls: Sequence[ctypes.Structure]) -> None:
     """One kernel with every call's arguments, each on its own thread."""
     function = getattr(build(), f"{name}_{'f32' if dtype == torch.float32 else 'bf16'}")
     function((type(calls[0]) * len(calls))(*calls), len(calls))
@@ -151,9 +153,9 @@ def _shares(graph: Graph) -> list[tuple[int, int, int, int]]:
 
 
 def edge_pass(
-    graph: Graph, table: Tensor, edges: Tensor, first: Tensor, rest: list[Tensor], epsilon: float, update: bool, keep: bool
+    graph: Graph, table: Tensor, edges: Tensor, first: Tensor, rest: Sequence[Tensor], epsilon: float, update: bool, keep: bool
 ) -> tuple[Tensor, Tensor | None, tuple[Tensor, ...]]:
-    """``learn.gns._edge_pass``: the same arguments and results, ``dtype`` being that of ``edges``."""
+    """``learn.gns._edge_pass``: the same arguments and results, edges [edges, latent], ``dtype`` being that of ``edges``."""
     *layers, gamma, beta = rest
     receiver, sender = graph.receiver.int(), graph.sender.int()
     latent, count, dtype = len(gamma), len(layers) // 2, edges.dtype

@@ -232,7 +232,7 @@ class Muon:
         self.adam.restore(state)
 
 
-OPTIMIZERS = {"adam": Adam, "muon": Muon}
+OPTIMIZERS: dict[str, type[Adam] | type[Muon]] = {"adam": Adam, "muon": Muon}
 
 
 class _Interrupted(Exception):
@@ -288,12 +288,12 @@ class Trainer:
         torch.manual_seed(self.settings.seed)
         self.model = build_model(config.model, config.settings, self.spec, where).to(self.device)
         self.parameters = [parameter for parameter in self.model.parameters() if parameter.requires_grad]
-        self.optimizer = OPTIMIZERS[self.settings.optimizer](self.parameters, self.settings.weight_decay)
+        self.optimizer: Adam | Muon = OPTIMIZERS[self.settings.optimizer](self.parameters, self.settings.weight_decay)
         self.average = {name: value.detach().clone() for name, value in self.model.state_dict().items()}
         batch = None if self.settings.edges else self.settings.batch
         self.sampler = Sampler(self.train_data, config.data, batch, self.settings.seed, self.settings.edges, self.processes)
         self.generator = torch.Generator().manual_seed(self.settings.seed)
-        self.progress_state = {
+        self.progress_state: dict[str, Any] = {
             "step": 0, "seconds": 0.0, "validated_step": 0, "validations": 0, "best_mse": None, "best_step": None,
             "loss_sum": 0.0, "norm_sum": 0.0, "logged": 0, "validation_seconds": 0.0,
         }
@@ -360,6 +360,7 @@ class Trainer:
 
     @property
     def step(self) -> int:
+        """Optimiser steps done."""
         return self.progress_state["step"]
 
     def seconds(self) -> float:
@@ -370,6 +371,7 @@ class Trainer:
         """Share of the budget that is spent, 0..1."""
         if self.settings.steps is not None:
             return min(self.step / self.settings.steps, 1.0)
+        assert self.settings.minutes is not None  # the one or the other
         return min(self.seconds() / (60 * self.settings.minutes), 1.0)
 
     def run(self) -> dict:

@@ -30,7 +30,7 @@ class Container(Strict):
         read as context is all there is to know; with a(t) a substep, the truth would depend on what no frame tells.
         """
         t = frame_step * np.arange(frames + 1)
-        total = 0.0
+        total = np.zeros((frames, 1))
         for sine in self.sines:
             w = 2 * np.pi * sine.frequency
             integral = -np.cos(w * t + np.radians(sine.phase)) / w
@@ -47,6 +47,7 @@ class ContainerFamily(Strict):
     phase: Range | Literal["any"] = "any"
 
     def check(self, dim: int) -> None:
+        """Raise the first fault of a family in ``dim`` dimensions."""
         if self.sines[0] > self.sines[1]:
             raise mistake("container.sines", list(self.sines), "low must not exceed high")
         check_vectors("container", {"amplitude": self.amplitude}, dim)
@@ -55,6 +56,7 @@ class ContainerFamily(Strict):
             check_range("container.phase", self.phase)
 
     def draw(self, rng: np.random.Generator) -> Container:
+        """One shaking, its numbers fixed."""
         phase = (0.0, 360.0) if self.phase == "any" else self.phase
         return Container(sines=[
             Sine(amplitude=[sample(value, rng) for value in self.amplitude], frequency=sample(self.frequency, rng), phase=sample(phase, rng))

@@ -4,7 +4,7 @@
 class InputError(ValueError):
     """A mistake in what the user gave: names the file, the key, the value and the remedy in one line."""
 
-    def __init__(self, where: object, key: str, value: object, remedy: str):
+    def __init__(self, where: object, key: object, value: object, remedy: str):
         shown = repr(value)
         if len(shown) > 120:
             shown = shown[:117] + "..."

@@ -35,6 +35,7 @@ import zipfile
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -118,9 +119,10 @@ def export(
 def _slice(text: str) -> slice:
     """``"start:stop:step"`` (each part optional, forwards only: time runs so) or one frame number."""
     try:
+        if ":" not in text:
+            frame = int(text)
+            return slice(frame, frame + 1 or None)
         parts = [int(part) if part.strip() else None for part in text.split(":")]
-        if len(parts) == 1:
-            return slice(parts[0], parts[0] + 1 or None)
         chosen = slice(*parts)
         if chosen.step is None or chosen.step > 0:
             return chosen
@@ -290,9 +292,9 @@ def _write_vtkhdf(
         block = max(1, _BLOCK // max(particles, 1))
         for first in range(0, count, block):
             some = frames[first : first + block]
-            rows = slice(first * particles, (first + len(some)) * particles)
-            points[rows] = _in_space(position[some]).reshape(-1, 3)
-            speeds[rows] = _in_space(velocities(position, some, frame_step, period)).reshape(-1, 3)
+            block_rows = slice(first * particles, (first + len(some)) * particles)
+            points[block_rows] = _in_space(position[some]).reshape(-1, 3)
+            speeds[block_rows] = _in_space(velocities(position, some, frame_step, period)).reshape(-1, 3)
             disk.check()
 
 
@@ -332,7 +334,7 @@ def _metadata(source: _Source, format: str, exported: Exported) -> dict:
     split. ``source`` is ours, for the record: no reader asks for it.
     """
     first: dict = {}
-    most = 0
+    most, content = 0, source.content or {}
     for _, reader, number in _trajectories(source):
         values = _common(reader, number, format)
         first = first or values
@@ -348,13 +350,13 @@ def _metadata(source: _Source, format: str, exported: Exported) -> dict:
         "dim": first["dim"],
         "dt": first["frame_step"],
         "source": {
-            "generator": f"sluice {__version__}", "scene": source.content["scene"], "seed": source.content["seed"],
+            "generator": f"sluice {__version__}", "scene": content["scene"], "seed": content["seed"],
             "trajectories": exported.trajectories,
             "failed": {name: [number for split, number, _ in exported.failed if split == name] for name in source.shards},
             "left_out": exported.left_out,
         },
     }
-    statistics = source.content.get("statistics")
+    statistics = content.get("statistics")
     if not isinstance(statistics, dict):
         remedy = "metadata.json holds the statistics of the training split; generate that split"
         raise InputError(source.path / "dataset.json", "statistics", statistics, remedy)
@@ -435,7 +437,7 @@ def _write_npz(path: Path, trajectories: _Split) -> None:
 
 
 class _ArrayPickler(pickle.Pickler):
-    def reducer_override(self, item: object) -> object:
+    def reducer_override(self, item: object) -> Any:
         if type(item) is np.ndarray:
             return np.ndarray, ((0,), "b"), item.__reduce__()[2]  # an empty array that takes on shape, type and contents
         return NotImplemented
@@ -450,8 +452,8 @@ def _write_tfrecord(path: Path, trajectories: _Split) -> None:
     with path.open("wb") as file:
         for number, (position, kinds, context) in enumerate(trajectories):
             features = {"key": _field(3, _field(1, _varint(number))), "particle_type": _bytes_feature(kinds.astype("<i8"))}
-            lists = {"position": position} | ({"step_context": np.concatenate([*context.values()], axis=1)} if context else {})
-            lists = {name: b"".join(_field(1, _bytes_feature(frame.astype("<f4"))) for frame in frames) for name, frames in lists.items()}
+            arrays = {"position": position} | ({"step_context": np.concatenate([*context.values()], axis=1)} if context else {})
+            lists = {name: b"".join(_field(1, _bytes_feature(frame.astype("<f4"))) for frame in frames) for name, frames in arrays.items()}
             message = _field(1, _map(features)) + _field(2, _map(lists))
             length = struct.pack("<Q", len(message))
             file.write(length + struct.pack("<I", masked(crc32c(length))))
@@ -490,7 +492,7 @@ def masked(crc: int) -> int:
 
 def _crc_tables() -> list[np.ndarray]:
     """Table k [256]: what a byte becomes after k further bytes of zeros."""
-    register = np.arange(256, dtype=np.uint32)
+    register: np.ndarray = np.arange(256, dtype=np.uint32)
     for _ in range(8):
         register = register >> 1 ^ np.where(register & 1, np.uint32(0x82F63B78), np.uint32(0))
     tables = [register]

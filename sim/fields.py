@@ -20,10 +20,13 @@ Friction = Annotated[float, Field(ge=0, allow_inf_nan=False)] | Literal["sticky"
 
 
 class Strict(BaseModel):
+    """A part of a scene: unknown keys are refused, and nothing changes after it was read."""
+
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 def sample(value: Range, rng: np.random.Generator) -> float:
+    """The number, or one drawn uniformly from the range."""
     return float(rng.uniform(*value)) if isinstance(value, tuple) else float(value)
 
 

@@ -11,7 +11,7 @@ from PIL import Image
 
 from sim.domains import DOMAINS
 from sim.errors import InputError
-from sim.generate import scene_teacher, simulate, trajectory_seed
+from sim.generate import Teacher, scene_teacher, simulate, trajectory_seed
 from sim.render import render_strip
 from sim.scene import SceneFamily
 from sim.trajectory import Trajectory, atomic_path
@@ -53,7 +53,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not paths:
         print(InputError("sluice gallery", "scenes", str(options.scenes), "holds no scene of a domain"), file=sys.stderr)
         return 2
-    teachers, sections = {}, []
+    teachers: dict[str, Teacher] = {}
+    sections = []
     for path in sorted(paths):
         scene = SceneFamily.load(path).sample(trajectory_seed(0, "test", 0), "test")
         method = scene.solver.method

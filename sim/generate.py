@@ -26,7 +26,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol, cast
 
 import numpy as np
 from tqdm import tqdm
@@ -120,10 +120,12 @@ class Shard:
 
     @property
     def name(self) -> str:
+        """The shard's file within the data set."""
         return f"{self.split}/shard-{self.number:05d}.h5"
 
     @property
     def cost_name(self) -> str:
+        """What it cost and which trajectories failed, beside it."""
         return f"{self.split}/shard-{self.number:05d}.cost.json"
 
 
@@ -168,6 +170,7 @@ def generate(
             except OSError as error:
                 why = os.strerror(error.errno) if error.errno else str(error)
                 raise RunError(f"{out}: {why}; finished shards are kept, run the same command again to continue") from None
+    assert content is not None, "no split was asked for"
     return content
 
 
@@ -361,7 +364,7 @@ class _Damaged(Exception):
 
 def _summary(out: Path, shards: list[Shard]) -> dict:
     """The entry of a complete split in ``dataset.json``."""
-    costs = [_read_cost(out, shard) for shard in shards]
+    costs: list[Any] = [_read_cost(out, shard) for shard in shards]  # of finished shards, which have one
     failed = [entry for cost in costs for entry in cost["failed"]]
     count = sum(len(shard.scenes) for shard in shards)
     return {
@@ -392,7 +395,7 @@ def _run_workers(out: Path, shards: list[Shard], jobs: int, teacher: Callable[[]
         scenes = [scene for shard in shards for scene in shard.scenes.values()]
         largest = max(scenes, key=lambda scene: len(scene.particles(refine=1).position))
         while workers:
-            for connection in wait(list(workers)):
+            for connection in cast("list[Connection]", wait(list(workers))):
                 try:
                     kind, detail = connection.recv()
                     if kind == "scene":
@@ -409,16 +412,16 @@ def _run_workers(out: Path, shards: list[Shard], jobs: int, teacher: Callable[[]
                 elif kind == "error":
                     raise RunError(detail)
     finally:
-        for process in workers.values():
-            process.kill()
-        for connection, process in workers.items():
-            process.join()
+        for worker in workers.values():
+            worker.kill()
+        for connection, worker in workers.items():
+            worker.join()
             connection.close()
 
 
 def _epitaph(process: multiprocessing.process.BaseProcess) -> str:
     process.join()
-    code = process.exitcode
+    code = process.exitcode or 0
     how = f"was killed by signal {-code} ({signal.Signals(-code).name}; out of memory?)" if code < 0 else f"ended with exit code {code}"
     return f"a worker process {how}; finished shards are kept, run the same command again to continue"
 
@@ -458,7 +461,8 @@ def _work(connection: Connection, out: Path, teacher: Callable[[], Teacher]) -> 
 
 def _end_with_parent() -> None:
     """End this process when the parent dies, however it dies: an orphan would go on writing into a folder it no longer holds."""
-    wait([multiprocessing.parent_process().sentinel])
+    if (parent := multiprocessing.parent_process()) is not None:
+        wait([parent.sentinel])
     os._exit(1)
 
 
@@ -529,8 +533,8 @@ class _Moments:
     """Streaming sums over rows [n, dim] in float64. Means are small against deviations here, so plain sums of squares do."""
 
     count: int = 0
-    total: np.ndarray | float = 0.0
-    squares: np.ndarray | float = 0.0
+    total: np.ndarray = field(default_factory=lambda: np.zeros(()))
+    squares: np.ndarray = field(default_factory=lambda: np.zeros(()))
 
     def add(self, rows: np.ndarray) -> None:
         rows = rows.reshape(-1, rows.shape[-1])
@@ -608,7 +612,7 @@ def training_statistics(shards: list[Path], jobs: int = 1) -> dict | None:
             particles += part.particles
             frames += part.frames
             neighbours += part.neighbours
-    statistics = dict(zip(("velocity_mean", "velocity_std"), velocity.result(), strict=True))
+    statistics: dict = dict(zip(("velocity_mean", "velocity_std"), velocity.result(), strict=True))
     statistics |= dict(zip(("acceleration_mean", "acceleration_std"), acceleration.result(), strict=True))
     if context.count:
         statistics |= dict(zip(("context_mean", "context_std"), context.result(), strict=True))

@@ -36,7 +36,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import chain, islice
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import h5py
 import numpy as np
@@ -173,13 +173,13 @@ def import_data(
     files = {split: path / f"{split}{suffix}" for split in SPLITS if (path / f"{split}{suffix}").exists()}
     if not files:
         raise InputError(path, "source", str(path), f"holds no {', '.join(f'{split}{suffix}' for split in SPLITS)}; correct the folder or the format")
-    given = {"given": spacing, "dx": metadata.dx if format == "lagrangebench" else None}
-    spacing_from = next((name for name, value in given.items() if value is not None), "measured")
-    if spacing_from == "measured":
-        first = next(iter(files.values()))
-        spacing = _measured_spacing(_first(read(first, found), first, found), found)
+    if spacing is not None:
+        spacing_from = "given"
+    elif format == "lagrangebench" and metadata.dx is not None:
+        spacing_from, spacing = "dx", metadata.dx
     else:
-        spacing = given[spacing_from]
+        first = next(iter(files.values()))
+        spacing_from, spacing = "measured", _measured_spacing(_first(read(first, found), first, found), found)
     try:
         with atomic_folder(out) as folder:
             splits = {}
@@ -232,7 +232,8 @@ def _read_metadata(path: Path, format: str) -> _Metadata:
 
 def _write_split(folder: Path, split: str, runs: Iterable[Trajectory]) -> dict:
     """Write the shards of a split and return its entry of ``dataset.json``; nobody knows what the trajectories cost."""
-    names, count = [], 0
+    names: list[str] = []
+    count = 0
 
     def numbered() -> Iterator[tuple[int, Trajectory]]:
         nonlocal count
@@ -256,7 +257,7 @@ def _trajectory(source: _Source, file: Path, number: int, raw: _Raw, spacing: fl
     """Trajectory ``number`` of ``file``, checked."""
     position, kinds, context = _checked(source, file, number, raw)
     metadata = source.metadata
-    scene = {
+    scene: dict[str, Any] = {
         "name": _name(source.path), "dim": metadata.dim, "bounds": [list(ends) for ends in metadata.bounds], "gravity": source.gravity,
         "frame_step": source.frame_step, "frames": len(position), "radius": metadata.default_connectivity_radius, "spacing": spacing,
     }
@@ -368,7 +369,8 @@ def _read_tfrecord(path: Path, source: _Source) -> Iterator[_Raw]:
     """Trajectories of a file of TFRecords; layout as in ``sim.export``. A position may also be one value for all frames, as its reader allows."""
     for number, record in enumerate(_records(path)):
         with _reading(path, number):
-            context, lists = {}, {}
+            context: dict = {}
+            lists: dict = {}
             for field, part in _fields(memoryview(record)):
                 if field == 1:
                     context |= _entries(part)
@@ -559,7 +561,7 @@ class _ArrayUnpickler(pickle._Unpickler):
         raise pickle.UnpicklingError(f"names {module}.{name}, which is no array")
 
 
-def _plain(item: object) -> object:
+def _plain(item: object) -> Any:
     """Arrays of numbers as they are; of objects, tuples and lists as lists, two levels deep at most, which is all that is asked for."""
 
     def inner(item: object, depth: int) -> object:

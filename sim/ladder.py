@@ -6,6 +6,7 @@ Tracing the kernels for Taichi takes seconds, cached or not, and the rungs of a 
 from __future__ import annotations
 
 import inspect
+from typing import Any
 
 import numpy as np
 
@@ -35,7 +36,8 @@ class Rung:
 
 def solver_ladder(rungs: list[tuple[str, Kind, dict]], method: str) -> list[Rung]:
     """Rungs (name, kind, overrides of the method's solver), in the given order; those on one grid share a solver. Raises ``InputError``."""
-    solver, shared, made = solver_class(method), {}, []
+    solver, made = solver_class(method), []
+    shared: dict[tuple, Any] = {}
     known = [name for name in inspect.signature(solver).parameters if name not in ("name", "kind", "serial", "unguarded_step")]
     for name, kind, overrides in rungs:
         for key, value in overrides.items():

@@ -73,6 +73,7 @@ class _Solid(Strict):
         return None
 
     def distance(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Signed distance [n] and outward normal [n, dim] of points [n, dim], as the head of this file says."""
         raise NotImplementedError
 
     def _beyond(self, corners: np.ndarray) -> np.ndarray:
@@ -323,6 +324,7 @@ class _Family(Strict):
             raise mistake(f"{where}.count", list(self.count), "low must not exceed high")
 
     def place(self, bounds: np.ndarray, rng: np.random.Generator) -> _Solid:
+        """Draw one."""
         raise NotImplementedError
 
 
@@ -386,13 +388,15 @@ class PolygonFamily(_Family):
             return
         if self.center is not None:
             raise mistake(f"{where}.center", self.center, "fixed vertices have their place; remove center")
-        for index, vertex in enumerate(self.vertices):
+        vertices = self.vertices or []
+        for index, vertex in enumerate(vertices):
             check_vectors(where, {f"vertices[{index}]": vertex}, dim)
-        _check_outline(where, self.vertices)
+        _check_outline(where, vertices)
 
     def place(self, bounds: np.ndarray, rng: np.random.Generator) -> Polygon:
         if self.vertices is not None:
             return Polygon(kind="polygon", vertices=self.vertices, friction=self.friction)
+        assert self.radius is not None  # by ``check``
         radius, corners = sample(self.radius, rng), int(rng.integers(self.corners[0], self.corners[1] + 1))
         angles = rng.uniform(0, 2 * np.pi) + 2 * np.pi / corners * (np.arange(corners) + rng.uniform(-0.25, 0.25, corners))
         center = _center(self.center, np.full(2, radius), bounds, rng)
@@ -401,6 +405,8 @@ class PolygonFamily(_Family):
 
 
 class BallFamily(_Family):
+    """Discs (2D) or balls (3D)."""
+
     kind: Literal["ball"]
     radius: Range
     center: list[Range] | None = None
@@ -417,6 +423,8 @@ class BallFamily(_Family):
 
 
 class BoxFamily(_Family):
+    """Rectangles (2D) or boxes (3D) along the axes, ``size`` [low, high] an axis."""
+
     kind: Literal["box"]
     size: list[Range]
     center: list[Range] | None = None
@@ -434,6 +442,8 @@ class BoxFamily(_Family):
 
 
 class HalfspaceFamily(_Family):
+    """Everything behind a plane through ``point``, on the side that ``normal`` points away from."""
+
     kind: Literal["halfspace"]
     point: list[Range]
     normal: list[Range]
@@ -465,7 +475,7 @@ class FloorFamily(_Family):
 
     def place(self, bounds: np.ndarray, rng: np.random.Generator) -> Floor:
         pieces = int(rng.integers(self.pieces[0], self.pieces[1] + 1))
-        vertices = [[float(x), sample(self.height, rng)] for x in np.linspace(*bounds[0], pieces + 1)]
+        vertices = [[float(x), sample(self.height, rng)] for x in np.linspace(bounds[0, 0], bounds[0, 1], pieces + 1)]
         return Floor(kind="floor", vertices=vertices, friction=self.friction)
 
 
@@ -507,7 +517,8 @@ class MeshFamily(_Family):
         vertices, faces = np.asarray(surface.points, float), np.asarray(surface.regular_faces)
         return vertices - (vertices.min(0) + vertices.max(0)) / 2, faces
 
-    def place(self, bounds: np.ndarray, rng: np.random.Generator, geometry: tuple[np.ndarray, np.ndarray]) -> Mesh:
+    def place_mesh(self, bounds: np.ndarray, rng: np.random.Generator, geometry: tuple[np.ndarray, np.ndarray]) -> Mesh:
+        """Draw one of what ``read`` has found."""
         vertices = geometry[0] * sample(self.scale, rng)
         vertices = vertices + _center(self.center, np.ptp(vertices, axis=0) / 2, bounds, rng)
         return Mesh(kind="mesh", vertices=vertices.tolist(), faces=geometry[1].tolist(), friction=self.friction)
@@ -538,14 +549,14 @@ def _check_outline(where: str, vertices: list[list[float]]) -> None:
 
 
 def outside(obstacle: _Solid, anywhere: bool, bounds: np.ndarray) -> str | None:
-    """Why an obstacle is not where it must be: reaching into the box, and wholly inside where its place was ours to draw."""
+    """Why an obstacle is not where it must be: reaching into the box, ``bounds`` [dim, 2], and wholly inside where its place was ours to draw."""
     lower, upper = bounds.T
     extent = obstacle.extent()
     if extent is None:
         corners = np.stack(np.meshgrid(*bounds, indexing="ij"), -1).reshape(-1, len(bounds))
         signs = obstacle.distance(corners)[0] < 0
         crosses = signs.any() and not signs.all()
-        if obstacle.kind == "floor":
+        if isinstance(obstacle, Floor):
             heights = np.array(obstacle.vertices)[:, 1]
             crosses = heights.max() > lower[1] and heights.max() < upper[1]
         return None if crosses else "outside the box, or filling it"

@@ -46,12 +46,12 @@ def turns(offset: np.ndarray, period: np.ndarray) -> np.ndarray:
 
 
 def shortest(offset: np.ndarray, period: np.ndarray | None) -> np.ndarray:
-    """The shortest image of offsets: within half a period on every periodic axis."""
+    """The shortest image of offsets [..., dim]: within half a period on every periodic axis."""
     return offset if period is None else offset - turns(offset, period) * period
 
 
 def beside(position: np.ndarray, other: np.ndarray, period: np.ndarray | None) -> np.ndarray:
-    """The images of positions that are nearest to ``other``, particle by particle."""
+    """The images of positions [..., dim] that are nearest to ``other`` [..., dim], particle by particle."""
     return position if period is None else position - turns(np.asarray(position, float) - other, period) * period
 
 
@@ -65,7 +65,7 @@ def unwrapped(position: np.ndarray, period: np.ndarray | None, at: int = 0) -> n
 
 
 def wrapped(position: np.ndarray, bounds: np.ndarray, period: np.ndarray | None) -> np.ndarray:
-    """The images within the bounds, lower face included, for file and search."""
+    """The images of positions [..., dim] within the bounds [dim, 2], lower face included, for file and search."""
     if period is None:
         return position
     lower = np.asarray(bounds, float)[:, 0]

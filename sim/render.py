@@ -112,20 +112,20 @@ def _round_up(value: float) -> float:
 
 
 def speed_scale(speed: np.ndarray) -> Scale:
-    """Viridis from 0 to the 99.5th percentile of the finite values, rounded up: a single fast droplet must not darken the rest."""
+    """Viridis from 0 to the 99.5th percentile of the finite values [...], rounded up: a single fast droplet must not darken the rest."""
     finite = speed[np.isfinite(speed)]
     return Scale(_table("viridis"), 0.0, _round_up(float(np.percentile(finite, 99.5)) if finite.size else 0.0), "speed")
 
 
 def error_scale(error: np.ndarray) -> Scale:
-    """Light grey to dark red (OrRd) from 0 to the 99th percentile of the finite values (in particle spacings), rounded up."""
+    """Light grey to dark red (OrRd) from 0 to the 99th percentile of the finite values [...] (in particle spacings), rounded up."""
     finite = error[np.isfinite(error)]
     limit = _round_up(float(np.percentile(finite, 99.0)) if finite.size else 0.0)
     return Scale(_table("OrRd", 0.15, (222, 222, 222)), 0.0, limit, "distance to truth, in spacings")
 
 
 def type_scale(particle_type: np.ndarray) -> Scale:
-    """One fixed colour per particle type id, swatches for the types that are present."""
+    """One fixed colour per particle type id [particles], swatches for the types that are present."""
     names = {number: name for name, number in PARTICLE_TYPES.items()}
     table = np.tile(np.asarray(KINEMATIC_GREY, np.uint8), (256, 1))
     for number, name in names.items():
@@ -357,13 +357,13 @@ class _Sheet:
         for row, line in enumerate(lines):
             if one_scale and row < rows - 1:
                 continue
-            top = self.corners[row * columns][1] + view.height + bar / 2
+            middle = self.corners[row * columns][1] + view.height + bar / 2
             first = 0
             for column in range(1, len(line) + 1):
                 if column == len(line) or line[column].scale is not line[first].scale:
                     left = self.corners[row * columns + first][0]
                     right = self.corners[row * columns + column - 1][0] + view.width
-                    self._legend(draw, line[first].scale, (left + right) / 2, top, unit)
+                    self._legend(draw, line[first].scale, (left + right) / 2, middle, unit)
                     first = column
 
     def _legend(self, draw, scale: Scale, middle: float, y: float, unit: float) -> None:
@@ -384,8 +384,8 @@ class _Sheet:
         draw.text((x, y), low, MUTED, self.font, anchor="lm")
         x += wide(low) + space
         for i in range(length):
-            colour = tuple(int(c) for c in scale.table[i * (len(scale.table) - 1) // (length - 1)])
-            draw.line((x + i, y - thick / 2, x + i, y + thick / 2), fill=colour)
+            shade = tuple(int(c) for c in scale.table[i * (len(scale.table) - 1) // (length - 1)])
+            draw.line((x + i, y - thick / 2, x + i, y + thick / 2), fill=shade)
         draw.text((x + length + space, y), high, MUTED, self.font, anchor="lm")
 
     def picture(self, parts: Sequence[np.ndarray], footer: str) -> np.ndarray:
@@ -443,10 +443,11 @@ def render_film(
     with atomic_path(path) as temporary, tempfile.TemporaryFile() as said:
         command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-v", "error", *raw, *coded, str(temporary)]
         with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=said, start_new_session=True) as ffmpeg:
+            assert ffmpeg.stdin is not None  # a pipe
             try:
                 with suppress(BrokenPipeError):  # it ended early; its exit code tells
                     for picture in pictures:
-                        ffmpeg.stdin.write(np.ascontiguousarray(picture))
+                        ffmpeg.stdin.write(np.ascontiguousarray(picture).data)
                     ffmpeg.stdin.close()
                 failed = ffmpeg.wait()
             except BaseException:
@@ -466,7 +467,7 @@ def render_still(
     path: str | Path, panes: Sequence[Pane], bounds: np.ndarray, spacing: float, *,
     picture: int = 0, footer: str = "", columns: int | None = None, width: int = PANE_WIDTH, gravity: Sequence[float] | None = None,
 ) -> None:  # fmt: skip
-    """Write one picture of the panes as PNG; ``picture`` indexes the panes' pictures, the rest is as in ``render_film``."""
+    """Write one picture of the panes in a box ``bounds`` [dim, 2] as PNG; ``picture`` indexes the panes' pictures, the rest as in ``render_film``."""
     from PIL import Image
 
     chosen = [Pane(pane.title, pane.position[picture][None], pane.value[picture][None], pane.scale) for pane in panes]
@@ -479,7 +480,7 @@ def render_still(
 
 
 def film_frames(frames: int, at_most: int = FILM_FRAMES) -> np.ndarray:
-    """Evenly spaced frame numbers from 0, no more than ``at_most``: every k-th frame, so that motion stays even."""
+    """[pictures]: evenly spaced frame numbers from 0, no more than ``at_most``: every k-th frame, so that motion stays even."""
     return np.arange(0, frames, max(1, math.ceil(frames / at_most)))
 
 

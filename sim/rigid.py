@@ -216,6 +216,7 @@ class Bodies:
 
     @ti.func
     def find_contacts(self, dt):
+        """Contacts of all bodies with walls, obstacles and each other, within what a step dt may close."""
         half = self.half[None]
         self.touching[None] = 0
         for b in range(self.count[None]):
@@ -260,6 +261,7 @@ class Bodies:
 
     @ti.func
     def point_velocity(self, b, at):
+        """Velocity of body b at a place: v + w x r."""
         return self.velocity[b] + self.unit() * self.spin[b].cross(self.arm(b, at))
 
     @ti.func
@@ -433,7 +435,8 @@ def body_table(scene: Scene, particles, place: np.ndarray, unit: float, wall: fl
             faces = np.concatenate([np.c_[-np.eye(dim), bottom], np.c_[np.eye(dim), -top]])
         # n.x + e <= 0 in space becomes n.X <= offset from the centre.
         offset = -faces[:, dim] / unit - faces[:, :dim] @ (lower / unit - wall + centre[:dim])
-        row[:6] = members[0], members[-1] + 1, mass, np.linalg.norm(arm, axis=1).max(), body.radius / unit if body.kind == "ball" else 0.0, len(faces)
+        ball = (body.radius or 0.0) / unit if body.kind == "ball" else 0.0
+        row[:6] = members[0], members[-1] + 1, mass, np.linalg.norm(arm, axis=1).max(), ball, len(faces)
         row[6:9], row[9 : 9 + dim], row[12:21] = centre, body.velocity, (np.trace(second) * np.eye(3) - second).ravel()
         shape = row[COLUMNS : COLUMNS + 4 * len(faces)].reshape(-1, 4)
         shape[:, :dim], shape[:, 3] = faces[:, :dim], offset

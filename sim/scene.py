@@ -238,6 +238,8 @@ Solver = Annotated[MaterialPoints | WeaklyCompressible | Incompressible | Positi
 
 
 class Splits(_Strict):
+    """Trajectories of each split, where a command does not say how many."""
+
     train: Annotated[int, Field(ge=0)]
     valid: Annotated[int, Field(ge=0)]
     test: Annotated[int, Field(ge=0)]
@@ -297,8 +299,8 @@ class _Physics(_Strict):
                 raise _mistake(f"bounds[{axis}]", [lower, upper], "lower must be below upper")
         edges = [(upper - lower) / cells for (lower, upper), cells in zip(self.bounds, self.cells, strict=True)]
         if max(edges) > min(edges) * (1 + 1e-6):
-            remedy = [max(4, round((upper - lower) / edges[0])) for lower, upper in self.bounds]
-            raise _mistake("cells", self.cells, f"cells must be square (edges {[round(edge, 6) for edge in edges]}); try {remedy}")
+            square = [max(4, round((upper - lower) / edges[0])) for lower, upper in self.bounds]
+            raise _mistake("cells", self.cells, f"cells must be square (edges {[round(edge, 6) for edge in edges]}); try {square}")
         if self.radius < self.spacing:
             remedy = f"below the particle spacing {self.spacing:.6g}: no particle would have a neighbour; use at least {1.5 * self.spacing:.4g}"
             raise _mistake("radius", self.radius, remedy)
@@ -334,12 +336,12 @@ class _Physics(_Strict):
                     remedy = "MPM has no periodic boxes; choose solver.method wcsph or dfsph"
                 raise _mistake(f"periodic[{index}]", axis, remedy)
         for face, velocity in self.walls.velocity.items():
-            axis = "xyz".index(face[0])
+            across = "xyz".index(face[0])
             where = f"walls.velocity.{face}"
             if method == "mpm" or self.walls.friction != "sticky":
                 remedy = "only sticky walls of SPH scenes drag water along; set walls.friction: sticky and solver.method wcsph or dfsph"
                 raise _mistake(where, velocity, remedy)
-            if axis >= self.dim or face[0] in self.periodic or len(velocity) != self.dim or velocity[axis] != 0:
+            if across >= self.dim or face[0] in self.periodic or len(velocity) != self.dim or velocity[across] != 0:
                 raise _mistake(where, velocity, f"must be the velocity of a wall of this box, {self.dim} entries, none through the wall itself")
         if method != "mpm" and self.walls.friction not in (0, "sticky"):
             raise _mistake("walls.friction", self.walls.friction, "SPH walls slip (0) or hold viscous water (sticky); MPM has Coulomb friction")
@@ -376,7 +378,7 @@ class _Physics(_Strict):
                 raise _mistake(f"{where}.model", material.model, remedy)
             if name in waters[1:]:
                 raise _mistake(f"{where}.model", "water", f"position-based scenes hold one kind of water, here {waters[0]}; leave one out")
-            if getattr(material, "viscosity", 0):
+            if isinstance(material, Water) and material.viscosity:
                 remedy = "position-based water has none but solver.xsph; use 0, or solver.method dfsph"
                 raise _mistake(f"{where}.viscosity", material.viscosity, remedy)
 
@@ -450,14 +452,15 @@ class Body(_Strict):
             return np.array(self.lower), np.array(self.upper)
         if self.kind == "ball":
             return np.array(self.center) - self.radius, np.array(self.center) + self.radius
-        return np.min(self.vertices, axis=0), np.max(self.vertices, axis=0)
+        vertices = np.array(self.vertices)
+        return vertices.min(0), vertices.max(0)
 
     def inside(self, points: np.ndarray) -> np.ndarray:
         """[n] bool: which points [n, dim] lie in the body."""
         if self.kind == "box":
             return np.ones(len(points), bool)
         if self.kind == "ball":
-            return ((points - self.center) ** 2).sum(1) <= self.radius**2
+            return ((points - np.array(self.center)) ** 2).sum(1) <= np.array(self.radius) ** 2
         equations = ConvexHull(self.vertices).equations
         return (points @ equations[:, :-1].T + equations[:, -1] <= 0).all(1)
 
@@ -542,7 +545,7 @@ class Scene(_Physics):
 
     def refinement(self, particles: Literal["teacher", "recorded"] | int) -> int:
         """How much finer than the recorded ones a solver's particles are, by its setting ``particles``. Raises ``InputError``."""
-        if particles in ("teacher", "recorded"):
+        if isinstance(particles, str):
             return self.refine if particles == "teacher" else 1
         if particles > self.refine:
             raise InputError(self.name, "particles", particles, f"finer than the teacher's, which are refined {self.refine} times; use teacher")
@@ -585,7 +588,7 @@ class Scene(_Physics):
 
 
 class SceneFamily:
-    """A validated scene file; ``sample(seed)`` draws a ``Scene``."""
+    """A validated scene file; ``sample(seed)`` draws a ``Scene``. Every mistake in it is an ``InputError``."""
 
     def __init__(self, content: dict, where: object, variant: str | None = None):
         self.where = where
@@ -618,6 +621,7 @@ class SceneFamily:
         return cls(read_yaml(path), path, variant)
 
     def to_dict(self) -> dict:
+        """Plain JSON, of which another family can be made."""
         content = self.model.model_dump(mode="json")
         for (name, key), spread in self.spreads.items():
             content["materials"][name][key] = {split: [list(ends) for ends in ranges] for split, ranges in spread.items()}
@@ -625,7 +629,7 @@ class SceneFamily:
 
     def sample(self, seed: int, split: str = "train") -> Scene:
         """Draw one scene of a split (they differ where a material number's ranges do). Bodies and obstacles are placed by rejection
-        until they lie inside the box and bodies apart from each other and from obstacles."""
+        until they lie inside the box and bodies apart from each other and from obstacles. Raises ``InputError`` where that cannot be done."""
         model = self.model
         rng = np.random.default_rng(np.random.SeedSequence([seed, 0]))
         shared = {name: getattr(model, name) for name in _Physics.model_fields}
@@ -643,9 +647,9 @@ class SceneFamily:
         reason = ("bodies", "outside the box")
         for _ in range(_TRIES):
             bodies: list[Body] = []
-            obstacles, fault = self._obstacles(solids, rng)
-            if fault:
-                reason = fault
+            obstacles, misplaced = self._obstacles(solids, rng)
+            if misplaced:
+                reason = misplaced
                 continue
             for index in chosen:
                 body = self._place(model.bodies[index], rng)
@@ -662,10 +666,10 @@ class SceneFamily:
     def _obstacles(self, chosen: list[int], rng: np.random.Generator) -> tuple[list, tuple[str, str] | None]:
         """Obstacles of the chosen families, or the first fault (key, why)."""
         bounds = np.array(self.model.bounds)
-        placed = []
+        placed: list[Obstacle] = []
         for index in chosen:
             solid = self.model.obstacles[index]
-            obstacle = solid.place(bounds, rng, self._meshes[index]) if solid.kind == "mesh" else solid.place(bounds, rng)
+            obstacle = solid.place_mesh(bounds, rng, self._meshes[index]) if solid.kind == "mesh" else solid.place(bounds, rng)
             fault = outside(obstacle, getattr(solid, "center", 0) is None and getattr(solid, "vertices", None) is None, bounds)
             if fault:
                 return placed, (f"obstacles[{index}]", fault)
@@ -690,7 +694,7 @@ class SceneFamily:
         else:
             center = np.array([_sample(value, rng) for value in family.center])
         velocity = [_sample(value, rng) for value in family.velocity] if family.velocity else [0.0] * model.dim
-        common = {"material": family.material, "kind": shape.kind, "velocity": velocity}
+        common: dict[str, Any] = {"material": family.material, "kind": shape.kind, "velocity": velocity}
         if shape.kind == "box":
             return Body(lower=(center - half).tolist(), upper=(center + half).tolist(), **common)
         if shape.kind == "ball":
@@ -735,7 +739,7 @@ _Spread = _Ranges | dict[Literal["train", "valid", "test"], _Ranges]
 
 def _without_spreads(content: dict, where: object) -> tuple[dict, dict[tuple[str, str], dict[str, list[tuple[float, float]]]]]:
     """A family's content with one number in place of each varying one, and (material, key) -> split -> ranges."""
-    spreads = {}
+    spreads: dict[tuple[str, str], dict[str, list[tuple[float, float]]]] = {}
     materials = content.get("materials")
     for name, material in (materials.items() if isinstance(materials, dict) else ()):
         for key, value in (material.items() if isinstance(material, dict) else ()):
@@ -744,18 +748,18 @@ def _without_spreads(content: dict, where: object) -> tuple[dict, dict[tuple[str
             place = f"materials.{name}.{key}"
             remedy = "must be a number, a range [low, high], several ranges, or those for each of train, valid, test"
             try:
-                spread = TypeAdapter(_Spread).validate_python(value)
+                spread: Any = TypeAdapter(_Spread).validate_python(value)
             except ValidationError:
                 raise InputError(where, place, value, remedy) from None
-            by_split = spread if isinstance(spread, dict) else dict.fromkeys(SPLITS, spread)
-            by_split = {split: [ranges] if isinstance(ranges, tuple) else ranges for split, ranges in by_split.items()}
+            each = spread if isinstance(spread, dict) else dict.fromkeys(SPLITS, spread)
+            by_split = {split: [ranges] if isinstance(ranges, tuple) else ranges for split, ranges in each.items()}
             if set(by_split) != set(SPLITS) or not all(by_split.values()):
                 raise InputError(where, place, value, remedy)
             if any(low > high for ranges in by_split.values() for low, high in ranges):
                 raise InputError(where, place, value, "low must not exceed high")
             spreads[name, key] = by_split
-    for (name, key), spread in spreads.items():
-        content = _merged(content, {"materials": {name: {key: spread["train"][0][0]}}})
+    for (name, key), ranges_by_split in spreads.items():
+        content = _merged(content, {"materials": {name: {key: ranges_by_split["train"][0][0]}}})
     return content, spreads
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -82,6 +82,17 @@ class Simulator(Protocol):
         """The next k >= 1 frames, [k, particles, dim] float32 (a model that predicts m frames at once returns m)."""
 
 
+@runtime_checkable
+class ManySimulator(Simulator, Protocol):
+    """A simulator that takes several starts of one box at once."""
+
+    def begin_many(self, starts: Sequence[Start]) -> None:
+        """``begin`` for all."""
+
+    def advance_many(self, which: Sequence[int]) -> list[np.ndarray | SimulationError]:
+        """``advance`` of these starts: frames of each, or why there are none."""
+
+
 @dataclass(frozen=True)
 class Rollout:
     """position [frames, particles, dim] float32, NaN after a failure; seconds: run time without ``begin``; status as in ``Trajectory``; escaped: the
@@ -102,7 +113,8 @@ class _Run:
     """A rollout on its way."""
 
     def __init__(self, start: Start, frames: int):
-        self.start, self.frames, self.done, self.seconds, self.status, self.escaped = start, frames, 0, 0.0, "ok", None
+        self.start, self.frames, self.done, self.seconds, self.status = start, frames, 0, 0.0, "ok"
+        self.escaped: int | None = None
         self.position = np.full((frames, *start.history.shape[1:]), np.nan, np.float32)
         self._moving, (self._lower, self._upper) = start.particle_type != KINEMATIC_TYPE, np.asarray(start.walls, float).T
 
@@ -144,7 +156,7 @@ def rollout(simulator: Simulator, start: Start, frames: int) -> Rollout:
     while run.going:
         begun = clock()
         try:
-            block = simulator.advance()
+            block: np.ndarray | SimulationError = simulator.advance()
         except SimulationError as error:
             block = error
         run.seconds += clock() - begun
@@ -155,7 +167,7 @@ def rollout(simulator: Simulator, start: Start, frames: int) -> Rollout:
 def rollouts(simulator: Simulator, starts: Sequence[Start], frames: Sequence[int]) -> list[Rollout]:
     """``rollout`` from several starts of one box: together where the simulator has ``begin_many`` and ``advance_many`` (``learn.gns``), each then
     with its share of the seconds; else one after the other."""
-    if not hasattr(simulator, "begin_many"):
+    if not isinstance(simulator, ManySimulator):
         return [rollout(simulator, start, count) for start, count in zip(starts, frames, strict=True)]
     clock = time.perf_counter
     begun = clock()

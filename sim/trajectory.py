@@ -19,6 +19,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -60,6 +61,7 @@ class Trajectory:
 
     @property
     def ok(self) -> bool:
+        """Whether it ran to its end."""
         return self.status == "ok"
 
     @property
@@ -119,7 +121,7 @@ def vacant(path: str | Path) -> Path:
 def atomic_folder(path: Path) -> Iterator[Path]:
     """Yield a temporary folder beside ``path``; on success flush its files and rename it, on any error remove it. Complete or absent.
 
-    A write in it that fails is an ``OSError`` that names ``path``, as by ``atomic_path``.
+    A write in it that fails is an ``OSError`` that names ``path``, as by ``atomic_path``; a folder that cannot be made, an ``InputError``.
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
@@ -147,7 +149,8 @@ class Disk(io.FileIO):
 
     error: BaseException | None = None
 
-    def write(self, data: memoryview) -> int:
+    def write(self, data: Any) -> int:
+        """As of any file; what is written after an error is dropped."""
         try:
             rest = memoryview(data).cast("B")
             while self.error is None and rest:
@@ -157,11 +160,12 @@ class Disk(io.FileIO):
         return len(data)
 
     def truncate(self, size: int | None = None) -> int:
+        """As of any file; an error is kept."""
         try:
             return super().truncate(size)
         except BaseException as error:
             self.error = self.error or error
-            return size
+            return size or 0
 
     def check(self) -> None:
         """Raise what went wrong."""
@@ -280,6 +284,7 @@ class ShardReader:
 
     @property
     def file(self) -> h5py.File:
+        """The open file. Raises ``InputError`` where it is absent, damaged or of another version."""
         if self._file is None:
             if not self.path.is_file():
                 raise InputError(self.path, "file", str(self.path), "no such shard; generate it or correct the path")
@@ -296,6 +301,7 @@ class ShardReader:
         return self._file
 
     def close(self) -> None:
+        """Close the file; reading opens it again."""
         if self._file is not None:
             self._file.close()
             self._file = None

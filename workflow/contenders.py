@@ -10,7 +10,7 @@ from learn.compare import CompareSettings
 from learn.dataset import Dataset
 from learn.rollout import check_fit
 from sim.ladder import solver_ladder
-from sim.simulator import Simulator
+from sim.simulator import Kind, Simulator
 from sim.trajectory import Trajectory
 from workflow.names import FLOOR, REFERENCE
 from workflow.study import Study, rung_settings
@@ -44,7 +44,7 @@ def learned(study: Study, comparison: str, model: str) -> list[Simulator]:
 def contenders(study: Study, comparison: str, trajectories: list[Trajectory], kinds: tuple[str, ...]) -> list[Simulator]:
     """Contenders of the given kinds."""
     entry = study.comparisons[comparison]
-    rungs = [(REFERENCE, "reference", {}), *((rung["name"], "solver", rung_settings(rung)) for rung in entry["ladder"])]
+    rungs: list[tuple[str, Kind, dict]] = [(REFERENCE, "reference", {}), *((rung["name"], "solver", rung_settings(rung)) for rung in entry["ladder"])]
     rungs.append((FLOOR, "floor", {"perturbation": PERTURBATION * trajectories[0].radius}))
     models = [contender for model in entry["learned"] for contender in learned(study, comparison, model)]
     method = trajectories[0].scene.get("solver", {}).get("method", "mpm")

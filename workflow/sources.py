@@ -26,6 +26,7 @@ def _file(module: str) -> Path | None:
 def _parsed(module: str) -> tuple[str, frozenset[str]]:
     """(hash of the module's code, names it imports that may be modules of ours)."""
     file = _file(module)
+    assert file is not None, module
     tree, foreign = ast.parse(file.read_text()), file.with_suffix(".cpp")
     names: set[str] = set()
     for node in ast.walk(tree):
@@ -34,11 +35,11 @@ def _parsed(module: str) -> tuple[str, frozenset[str]]:
         elif isinstance(node, ast.ImportFrom):
             if node.level:
                 raise ValueError(f"{module}, line {node.lineno}: relative import; imports are absolute here")
-            names |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
-        body = getattr(node, "body", None)
-        documented = isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and body and isinstance(body[0], ast.Expr)
-        if documented and isinstance(body[0].value, ast.Constant):
-            node.body = body[1:]
+            names |= {node.module or "", *(f"{node.module}.{alias.name}" for alias in node.names)}
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and node.body:
+            first = node.body[0]
+            if isinstance(first, ast.Expr) and isinstance(first.value, ast.Constant):
+                node.body = node.body[1:]
     code = ast.dump(tree).encode() + (foreign.read_bytes() if foreign.is_file() else b"")
     return hashlib.sha256(code).hexdigest(), frozenset(names)
 
@@ -69,7 +70,7 @@ def code_hash(*modules: str, method: str | None = None) -> str:
 @cache
 def registered_models() -> dict[str, str]:
     """Name of a model -> module that defines it, read from the registry in ``learn/model.py`` (importing it would import torch)."""
-    for node in ast.parse(_file("learn.model").read_text()).body:
+    for node in ast.parse((ROOT / "learn/model.py").read_text()).body:
         if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "MODELS":
             return {name: module for name, (module, _) in ast.literal_eval(node.value).items()}
     raise ValueError("learn/model.py: no MODELS")

@@ -74,22 +74,27 @@ class Study:
 
     @property
     def name(self) -> str:
+        """That of its file."""
         return self.path.stem
 
     @property
     def folder(self) -> Path:
+        """Where all of its results are."""
         return Path("results") / self.name
 
     @property
     def data(self) -> dict[str, dict]:
+        """Data sets by name."""
         return self.content["data"]
 
     @property
     def models(self) -> dict[str, dict]:
+        """Models by name."""
         return self.content["models"]
 
     @property
     def comparisons(self) -> dict[str, dict]:
+        """Comparisons by name."""
         return self.content["comparisons"]
 
     @property
@@ -104,6 +109,7 @@ class Study:
     # -- places
 
     def data_folder(self, data: str, part: str) -> Path:
+        """A data set's, or of a part of it (``PARTS``)."""
         return self.folder / "data" / data / part
 
     def data_stamp(self, data: str, part: str) -> Path:
@@ -122,9 +128,11 @@ class Study:
         return [self.folder / "models" / model / f"seed-{seed}.pt" for seed in entry["seeds"]]
 
     def comparison_file(self, comparison: str, name: str) -> Path:
+        """A file of a comparison: errors.json, timing.json, ..."""
         return self.folder / "comparisons" / comparison / name
 
     def picture(self, comparison: str, name: str) -> Path:
+        """A picture or film of a comparison."""
         return self.folder / "pictures" / comparison / name
 
     def pictures(self, comparison: str) -> list[Path]:
@@ -209,6 +217,7 @@ class Study:
         return digest(self.content, code_hash("workflow.scripts.stability_report", *titles), _texts("sim/page.*", "sim/stability/*.html"))
 
     def budget(self, model: str) -> dict[str, float]:
+        """Of a model's trainings, where the study has one of its own."""
         return {key: self.models[model][key] for key in ("minutes", "steps") if key in self.models[model]}
 
     @cached_property
@@ -321,9 +330,9 @@ def _check_comparison(study: Study, name: str, entry: dict) -> None:
         if metric.startswith("rollout_mse"):
             moments = [str(horizon) for horizon in entry["horizons"]] + ["all"]
         else:
-            moments = [f"{share:g}" for share in CLOUD_TIMES] if metric in CLOUD_METRICS else [None]
-        if at not in moments:
-            remedy = f"{metric} is known at {', '.join(moments)}" if moments[0] else f"{metric} is one figure; leave it out"
+            moments = [f"{share:g}" for share in CLOUD_TIMES] if metric in CLOUD_METRICS else []
+        if at not in moments and not (at is None and not moments):
+            remedy = f"{metric} is known at {', '.join(moments)}" if moments else f"{metric} is one figure; leave it out"
             raise InputError(path, f"{where}.targets[{index}].at", target.get("at"), remedy)
 
 

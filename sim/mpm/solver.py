@@ -11,6 +11,7 @@ Decisions, measured on a CPU:
 import time
 from contextlib import nullcontext
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -124,7 +125,7 @@ class _Kernels:
             ti.field(ti.f32, capacity) if isinstance(field, ti.ScalarField) else ti.Vector.field(field.n, ti.f32, capacity) for field in self.state
         ]
         self.has_rigid = structure.rigid is not None
-        self.rigid = RigidBodies(self, *structure.rigid) if self.has_rigid else None
+        self.rigid: Any = None if structure.rigid is None else RigidBodies(self, *structure.rigid)  # used where ``has_rigid`` is compiled in
         if self.has_rigid:
             self.touched = ti.Vector.field(dim, ti.i32, 2)  # lowest and highest first node of a particle
         self.frame = (self.frame_rigid if self.has_rigid else self.frame_serial) if serial else self.frame_parallel
@@ -809,7 +810,7 @@ class MPMSimulator:
     model that predicts so many does: one launch, and one plan of the time step, for all).
 
     A scene's ``time_step`` holds unless ``cfl`` is given. ``unguarded_step`` [s] is for ``sim.stability`` alone: a fixed step that nothing
-    refuses or shortens, to see where the solver really becomes unstable.
+    refuses or shortens, to see where the solver really becomes unstable. Raises ``InputError`` for overrides that cannot go together.
     """
 
     def __init__(self, *, name: str = "mpm", kind: Kind = "reference", cfl: float | None = None, stiffness: float = 1.0, coarsen: float = 1.0,
@@ -822,12 +823,12 @@ class MPMSimulator:
         if particles != "recorded" and coarsen != 1.0:
             raise InputError(name, "coarsen", coarsen, "a coarser grid needs particles: recorded")
         self.name, self.kind = name, kind
-        self.settings = {"cfl": cfl, "stiffness": stiffness, "coarsen": coarsen, "particles": particles, "perturbation": perturbation,
-                         "frames": frames}
+        self.settings: dict[str, Any] = {
+            "cfl": cfl, "stiffness": stiffness, "coarsen": coarsen, "particles": particles, "perturbation": perturbation, "frames": frames,
+        }
         self.serial, self.unguarded_step = serial, unguarded_step
         self.compile_seconds = 0.0
-        self._kernels: _Kernels | None = None
-        self._scene: Scene | None = None
+        self._built: _Kernels | None = None
 
     # -- the state at frame 0
     def load(self, scene: Scene) -> None:
@@ -843,14 +844,17 @@ class MPMSimulator:
         particles = scene.particles(self._refine(scene))
         structure, nodes = self._structure(scene), tuple(int(c) + 2 * WALL + 1 for c in self._cells(scene))
         capacity = _capacity(len(particles.position))
-        old, fresh, columns = self._kernels, False, self._columns(scene, nodes)
-        alike = old is not None and old.structure == structure and old.nodes == nodes
-        if not alike or old.capacity < capacity or old.columns_at_most < len(columns):
+        old, fresh, columns = self._built, False, self._columns(scene, nodes)
+        if old is not None and (old.structure != structure or old.nodes != nodes):
+            old = None
+        if old is None or old.capacity < capacity or old.columns_at_most < len(columns):
             # Never less room than before, lest scenes with many particles and scenes with many columns compile anew in turns.
-            room = (old.capacity, old.columns_at_most) if alike else (0, 0)
+            room = (0, 0) if old is None else (old.capacity, old.columns_at_most)
             capacity, at_most = max(capacity, room[0]), max(_power_of_two(len(columns)), room[1])
-            self._kernels, fresh = _Kernels(structure, capacity, nodes, at_most, serial), True
-        kernels = self._kernels
+            self._built = _Kernels(structure, capacity, nodes, at_most, serial)
+            fresh = True
+        assert self._built is not None
+        kernels = self._kernels = self._built
         lower, upper = np.array(scene.bounds).T
         cells = self._cells(scene)
         self.dx = self._spacing(scene)
@@ -976,7 +980,7 @@ class MPMSimulator:
             return
         wave_speed, speed = self._at_start(scene, max(float(np.linalg.norm(body.velocity)) for body in scene.bodies))
         limits = self.limits(scene, self._spacing(scene), wave_speed, speed)
-        what = min(limits, key=limits.get)
+        what = min(limits, key=limits.__getitem__)
         if scene.time_step > limits[what] * (1 + 1e-6):
             steps = int(np.ceil(scene.frame_step / limits[what]))
             remedy = (
@@ -1157,18 +1161,18 @@ class MPMSimulator:
         kernels.v.from_numpy(lanes)
         self._run(0, 0.0, keep=True)
 
-    def inject(self, name: str, particle: int, value) -> None:
+    def inject(self, name: str, particle: int | np.ndarray, value) -> None:
         """Overwrite what ``state`` gives for one particle under a name (a material's: counted within it), positions in cells. For studies of
         what happens then."""
         kernels, dim = self._kernels, self._scene.dim
         if name == "velocity gradient":
-            fields = [(kernels.C[axis], slice(dim), column) for axis, column in enumerate(np.broadcast_to(value, (dim, dim)).T)]
+            fields: list[tuple] = [(kernels.C[axis], slice(dim), column) for axis, column in enumerate(np.broadcast_to(value, (dim, dim)).T)]
         elif name in ("position", "velocity"):
             fields = [({"position": kernels.x, "velocity": kernels.v}[name], slice(dim), value)]
         else:
             stuff, key = name.split(".")
             m = list(self._scene.materials).index(stuff)
-            particle += int(kernels.range.to_numpy()[m])
+            particle = particle + int(kernels.range.to_numpy()[m])
             state = list(MODELS[self._scene.materials[stuff].model].state(dim))
             fields = [(kernels.materials[m].fields()[state.index(key)], Ellipsis, value)]
         for field, lanes, content in fields:

@@ -129,6 +129,7 @@ class Bodies:
 
     @ti.func
     def wall_distance(self, x, f):
+        """Distance of a place to wall f."""
         axis = f // 2
         return ti.select(f % 2 == 0, x[axis] - self.base.extent[0][axis], self.base.extent[1][axis] - x[axis])
 
@@ -261,6 +262,7 @@ class Bodies:
 
     @ti.func
     def write_velocity(self, b):
+        """Velocities of the particles of body b: v + w x r."""
         R, w = rotation(self.turn[b]), self.spin(b, self.turn[b])
         for p in range(self.span[b][0], self.span[b][1]):
             u = self.velocity[b] + w.cross(R @ self.rest[p])

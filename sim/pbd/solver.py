@@ -48,13 +48,14 @@ One kernel a frame on one thread, as in ``sim.sph.solver``; lengths in support r
 
 import time
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from sim.errors import InputError
 from sim.mpm.decomposition import finite
 from sim.pbd.rigid import COLUMNS, Bodies, body_table
-from sim.scene import Scene
+from sim.scene import PositionBased, Scene
 from sim.simulator import Kind, SimulationError, Start
 from sim.sph.kernel import ENTRIES, constant, kernel, lattice_relaxation, lattice_scale, wall_table
 from sim.sph.neighbours import ROOM, SKIN, Neighbours
@@ -85,6 +86,11 @@ class Structure:
 def _capacity(particles: int) -> int:
     """Particles that fields are made for: few different numbers, for each compiles anew."""
     return 1 << max(int(particles) - 1, 63).bit_length()
+
+
+def _method(scene: Scene) -> PositionBased:
+    assert isinstance(scene.solver, PositionBased)
+    return scene.solver
 
 
 @ti.data_oriented
@@ -486,7 +492,7 @@ class PBDSimulator:
 
     Overrides make the rungs of a solver ladder: ``cfl`` (Courant number; default the scene's), ``particles`` ("teacher": refined as the scene
     says; "recorded": the tracked set alone; a number: so many times finer), ``tolerance`` (factor on the error at which a solve ends),
-    ``perturbation`` (length: random displacement of the start, for the chaos floor).
+    ``perturbation`` (length: random displacement of the start, for the chaos floor). Raises ``InputError`` for ones that cannot be.
     """
 
     def __init__(self, *, name: str = "pbd", kind: Kind = "reference", cfl: float | None = None, particles: str | int = "teacher",
@@ -494,7 +500,7 @@ class PBDSimulator:
         if particles not in ("teacher", "recorded") and not (isinstance(particles, int) and particles > 0):
             raise InputError(name, "particles", particles, "must be teacher, recorded or how many times finer than those")
         self.name, self.kind = name, kind
-        self.settings = {"cfl": cfl, "particles": particles, "tolerance": tolerance, "perturbation": perturbation}
+        self.settings: dict[str, Any] = {"cfl": cfl, "particles": particles, "tolerance": tolerance, "perturbation": perturbation}
         self.compile_seconds = 0.0
         self._built: tuple | None = None
 
@@ -502,7 +508,8 @@ class PBDSimulator:
     def _structure(self, scene: Scene) -> Structure:
         rigid = sum(scene.materials[body.material].model == "rigid" for body in scene.bodies)
         # Rounded up, so that scenes of a family share their kernels.
-        return Structure(scene.dim, 1 << (rigid - 1).bit_length() if rigid else 0, scene.solver.xsph > 0, scene.solver.tensile > 0)
+        solver = _method(scene)
+        return Structure(scene.dim, 1 << (rigid - 1).bit_length() if rigid else 0, solver.xsph > 0, solver.tensile > 0)
 
     def _refine(self, scene: Scene) -> int:
         return scene.refinement(self.settings["particles"])
@@ -510,14 +517,14 @@ class PBDSimulator:
     def _layout(self, scene: Scene) -> tuple[float, float, np.ndarray]:
         """Spacing and support radius [length], cells along each axis."""
         spacing = scene.spacing / self._refine(scene)
-        support = spacing * scene.solver.support
+        support = spacing * _method(scene).support
         cells = np.maximum(np.floor(np.ptp(scene.bounds, axis=1) / support / (1 + SKIN)).astype(int), 1)
         return spacing, support, cells
 
     def _sizes(self, scene: Scene, particles: int) -> tuple[int, int, int]:
         """Capacities in particles, cells and pairs."""
         capacity = _capacity(particles)
-        neighbours = {2: np.pi, 3: 4 * np.pi / 3}[scene.dim] * (scene.solver.support * (1 + SKIN)) ** scene.dim / 2
+        neighbours = {2: np.pi, 3: 4 * np.pi / 3}[scene.dim] * (_method(scene).support * (1 + SKIN)) ** scene.dim / 2
         return capacity, int(np.prod(self._layout(scene)[2] + 2)), int(ROOM * neighbours * capacity) + 4096
 
     def _density(self, scene: Scene) -> float:
@@ -527,7 +534,7 @@ class PBDSimulator:
 
     def _numbers(self, scene: Scene, particles: int) -> np.ndarray:
         """As ``_Kernels.load`` takes them."""
-        k, dim, solver = _Kernels, scene.dim, scene.solver
+        k, dim, solver = _Kernels, scene.dim, _method(scene)
         spacing, support, cells = self._layout(scene)
         numbers, d, width = np.zeros((4, k.NUMBERS)), spacing / support, np.ptp(scene.bounds, axis=1) / support
         row = numbers[0]
@@ -547,7 +554,8 @@ class PBDSimulator:
         gravity = float(np.linalg.norm(np.array(scene.gravity) - scene.acceleration(), axis=-1).max())
         way = (self.settings["cfl"] or scene.cfl) * self._layout(scene)[0]
         courant = 2 * way / max(speed + np.sqrt(speed**2 + 4 * gravity * way), np.finfo(float).tiny)
-        return {"the Courant number": courant, f"substeps {scene.solver.substeps}": scene.frame_step / scene.solver.substeps}
+        substeps = _method(scene).substeps
+        return {"the Courant number": courant, f"substeps {substeps}": scene.frame_step / substeps}
 
     def _fixed(self, scene: Scene) -> float | None:
         return None if self.settings["cfl"] else scene.time_step
@@ -557,7 +565,7 @@ class PBDSimulator:
         ``InputError``."""
         step, speed = self._fixed(scene), max(float(np.linalg.norm(body.velocity)) for body in scene.bodies)
         limits = self.limits(scene, speed)
-        what = min(limits, key=limits.get)
+        what = min(limits, key=limits.__getitem__)
         if step is not None and step > limits[what] * (1 + 1e-6):
             steps = int(np.ceil(scene.frame_step / limits[what]))
             remedy = (f"above the limit {limits[what]:.4g} s, which {what} sets (cfl {scene.cfl:g}, speed {speed:.3g} m/s); use at most "
@@ -661,7 +669,7 @@ class PBDSimulator:
     def frame(self) -> np.ndarray:
         """Advance one frame; positions of the recorded particles, [n, dim] float32. Raises ``SimulationError``: the state is then of no use."""
         k, scene, felt = _Kernels, self._scene, self._felt()
-        report = self._run(scene.frame_step, self._fixed(scene) or scene.frame_step / scene.solver.substeps, MOST_STEPS)
+        report = self._run(scene.frame_step, self._fixed(scene) or scene.frame_step / _method(scene).substeps, MOST_STEPS)
         if not np.isfinite(report).all() or report[k.BROKEN] or report[k.UNSOLVED] or report[k.FULL]:
             raise SimulationError(self._why(report))
         self._frame += 1
@@ -677,7 +685,7 @@ class PBDSimulator:
         if report[k.FULL]:
             return "particles have gathered beyond the room for pairs"
         if report[k.UNSOLVED]:
-            return (f"densities did not converge in {self._scene.solver.iterations} iterations (mean error {report[k.ERROR]:.2g}), at a step of "
+            return (f"densities did not converge in {_method(self._scene).iterations} iterations (mean error {report[k.ERROR]:.2g}), at a step of "
                     f"{report[k.STEP]:.3g} s")  # fmt: skip
         return f"more than {MOST_STEPS} steps in a frame: speeds run away"
 

@@ -26,7 +26,7 @@ def constant(dim: int) -> float:
     return {2: 7 / np.pi, 3: 21 / (2 * np.pi)}[dim]
 
 
-def kernel(dim: int, r: np.ndarray) -> np.ndarray:
+def kernel(dim: int, r: np.ndarray | float) -> np.ndarray:
     """W at distances r [...]."""
     r = np.minimum(r, 1.0)
     return constant(dim) * (1 - r) ** 4 * (1 + 4 * r)
@@ -109,7 +109,7 @@ SHARE, SLOPE, NORMAL, TANGENT, DRAG, SPREAD, STRETCH = range(7)
 
 
 def viscous_weight(r: np.ndarray) -> np.ndarray:
-    """f(r) = (1 - r)^(3/2), by which viscosity weighs a pair, in place of the |W'| / r of Monaghan (2005, eq. 8.11).
+    """f(r) = (1 - r)^(3/2) at distances r [...], by which viscosity weighs a pair, in place of the |W'| / r of Monaghan (2005, eq. 8.11).
 
     Any weight gives nu times the Laplacian if particles are many. Of few on a lattice |W'| / r is too steep: with a support of two
     spacings it makes shear along the lattice 0.54 and at 45 degrees 1.34 times as viscous as asked for; this one 0.97 and 1.03 (2.5

@@ -18,9 +18,9 @@ ROOM = 2.5
 #: Cells along a periodic axis: with fewer a pair would be met twice.
 FEWEST = 3
 #: Offsets of the cells after a particle's own, half of those around it; for periodic boxes, whose runs wrap around.
-FORWARD = {
+FORWARD: dict[int, list[tuple[int, ...]]] = {
     2: [(0, 1), (1, -1), (1, 0), (1, 1)],
-    3: [(0, 0, 1), (0, 1, -1), (0, 1, 0), (0, 1, 1)] + [(1, y, z) for y in (-1, 0, 1) for z in (-1, 0, 1)],
+    3: [(0, 0, 1), (0, 1, -1), (0, 1, 0), (0, 1, 1), *((1, y, z) for y in (-1, 0, 1) for z in (-1, 0, 1))],
 }
 
 

@@ -480,6 +480,7 @@ class RigidBodies(Bodies):
     # -- motion
     @ti.func
     def fall(self, dt, g):
+        """v += dt g."""
         for b in range(self.count[None]):
             self.velocity[b] += dt * lift(g)
 

@@ -9,6 +9,7 @@ Decision: one kernel a frame, on one thread, with the adaptive steps inside. Par
 
 import time
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from sim.errors import InputError
 from sim.mpm.decomposition import finite
 from sim.obstacles import combine
 from sim.rigid import NO_SLIP, body_table
-from sim.scene import Incompressible, Particles, Scene
+from sim.scene import Incompressible, Particles, Scene, Water, WeaklyCompressible
 from sim.signed_distance import between_nodes
 from sim.simulator import Kind, SimulationError, Start
 from sim.sph.dfsph import DFSPH, VISCOUS_ERROR
@@ -78,6 +79,17 @@ def _power_of_two(n: int) -> int:
     return 1 << max(n - 1, 7).bit_length()
 
 
+def _method(scene: Scene) -> WeaklyCompressible | Incompressible:
+    assert isinstance(scene.solver, (WeaklyCompressible, Incompressible))
+    return scene.solver
+
+
+def _sound(water: Water) -> float:
+    """[m/s]: scenes of WCSPH have it (``sim.scene``)."""
+    assert water.sound_speed is not None
+    return water.sound_speed
+
+
 @ti.data_oriented
 class _Kernels(Walls):
     """Fields and compiled code for one ``Structure``."""
@@ -104,8 +116,8 @@ class _Kernels(Walls):
         self.slide = ti.Vector.field(4, ti.f32, self.faces)
         self.neighbours = Neighbours(self.dim, capacity, cells, pairs, self.periodic)
         self.has_rigid = structure.rigid is not None
-        self.rigid = RigidBodies(self, *structure.rigid, wet) if self.has_rigid else None
-        self.scheme = (DFSPH if structure.method == "dfsph" else WCSPH)(self, capacity, pairs)
+        self.rigid: Any = None if structure.rigid is None else RigidBodies(self, *structure.rigid, wet)  # used where ``has_rigid`` is compiled in
+        self.scheme: Any = (DFSPH if structure.method == "dfsph" else WCSPH)(self, capacity, pairs)  # each has fields of its own
         self.state = [self.x, self.v, *self.scheme.state]
         self.moved, self.saved = ([ti.Vector.field(field.n, ti.f32, capacity) for field in self.state] for _ in range(2))
         self.moved_id, self.saved_id = (ti.field(ti.i32, capacity) for _ in range(2))
@@ -381,6 +393,7 @@ class SPHSimulator:
 
     A scene's ``time_step`` holds unless ``cfl`` is given. ``unguarded_step`` [s] is for ``sim.stability`` alone: a fixed step that nothing
     refuses or shortens, pressures that did not converge included, to see where the solver really becomes unstable.
+    Raises ``InputError`` for overrides that cannot be.
     """
 
     def __init__(self, *, name: str = "sph", kind: Kind = "reference", cfl: float | None = None, particles: str | int = "teacher",
@@ -388,7 +401,9 @@ class SPHSimulator:
         if particles not in ("teacher", "recorded") and not (isinstance(particles, int) and particles > 0):
             raise InputError(name, "particles", particles, "must be teacher, recorded or how many times finer than those")
         self.name, self.kind = name, kind
-        self.settings = {"cfl": cfl, "particles": particles, "tolerance": tolerance, "stiffness": stiffness, "perturbation": perturbation}
+        self.settings: dict[str, Any] = {
+            "cfl": cfl, "particles": particles, "tolerance": tolerance, "stiffness": stiffness, "perturbation": perturbation,
+        }
         self.unguarded_step = unguarded_step
         self.compile_seconds = 0.0
         self._built: tuple | None = None
@@ -417,7 +432,7 @@ class SPHSimulator:
     def _layout(self, scene: Scene) -> tuple[float, float, np.ndarray]:
         """Spacing and support radius [length], cells along each axis."""
         spacing = scene.spacing / self._refine(scene)
-        support = spacing * scene.solver.support
+        support = spacing * _method(scene).support
         lower, upper = np.array(scene.bounds).T
         cells = np.maximum(np.floor((upper - lower) / support / (1 + SKIN)).astype(int), 1)
         for axis, count in zip("xyz", cells, strict=False):
@@ -435,7 +450,7 @@ class SPHSimulator:
         """As ``_Kernels.load`` takes them."""
         spacing, support, cells = self._layout(scene)
         lower, upper = np.array(scene.bounds).T
-        dim, water, solver, k = scene.dim, self._water(scene), scene.solver, _Kernels
+        dim, water, solver, k = scene.dim, self._water(scene), _method(scene), _Kernels
         numbers = np.zeros((5 + 2 * dim, k.NUMBERS))
         row = numbers[0]
         d = spacing / support
@@ -446,7 +461,7 @@ class SPHSimulator:
             row[k.DENSITY_ERROR], row[k.DIVERGENCE_ERROR] = (self.settings["tolerance"] * e for e in (solver.density_error, solver.divergence_error))
             row[k.ITERATIONS], row[k.XSPH], row[k.SHIFT] = solver.iterations, solver.xsph, lattice_shift(dim, d)
         else:
-            row[k.SOUND] = water.sound_speed * np.sqrt(self.settings["stiffness"]) / support
+            row[k.SOUND] = _sound(water) * np.sqrt(self.settings["stiffness"]) / support
             # Its density is not a sum: only gradients use the kernel.
             row[k.KERNEL] *= lattice_slope(dim, d)
             row[k.GAMMA], row[k.ALPHA], row[k.DELTA] = water.gamma, solver.artificial_viscosity, solver.density_diffusion
@@ -458,8 +473,8 @@ class SPHSimulator:
             numbers[4 + 2 * "xyz".index(face[0]) + "-+".index(face[1]), :dim] = np.array(velocity) / support
         return numbers
 
-    def _water(self, scene: Scene):
-        return next(material for material in scene.materials.values() if material.model == "water")
+    def _water(self, scene: Scene) -> Water:
+        return next(material for material in scene.materials.values() if isinstance(material, Water))
 
     def _water_first(self, scene: Scene, particles: Particles) -> tuple[np.ndarray, int]:
         """Order in which particles are stored, bodies after water, and how many are water's."""
@@ -482,7 +497,7 @@ class SPHSimulator:
         """Room for particles, cells, pairs and pairs of bodies with water; nodes of the signed distance."""
         spacing, _, cells = self._layout(scene)
         capacity = _capacity(particles)
-        reach = scene.solver.support * (1 + SKIN)
+        reach = _method(scene).support * (1 + SKIN)
         around = ROOM * {2: np.pi, 3: 4 * np.pi / 3}[scene.dim] * reach**scene.dim / 2
         pairs, wet = int(around * capacity) + 4096, int(around * _capacity(bodies)) if bodies else 0
         lower, upper = np.array(scene.bounds).T
@@ -503,7 +518,7 @@ class SPHSimulator:
             speed = max(speed, *(float(np.linalg.norm(velocity)) for velocity in scene.walls.velocity.values()), 0.0)
             speed += float(np.sqrt(max(pull @ np.subtract(*body.extent()[::-1]) for body in scene.bodies) / 2))
             return {"the Courant number": 2 * way / max(speed + np.sqrt(speed**2 + 4 * gravity * way), tiny)}
-        sound = water.sound_speed * np.sqrt(self.settings["stiffness"])
+        sound = _sound(water) * np.sqrt(self.settings["stiffness"])
         return {
             "the Courant number": way / (sound + speed), "the speed of sound": LARGEST_COURANT * support / 2 / sound,
             "the viscosity": LARGEST_VISCOUS * (support / 2) ** 2 / max(water.viscosity / water.density, tiny),
@@ -524,7 +539,7 @@ class SPHSimulator:
             return
         speed = max(float(np.linalg.norm(body.velocity)) for body in scene.bodies)
         limits = self.limits(scene, speed)
-        what = min(limits, key=limits.get)
+        what = min(limits, key=limits.__getitem__)
         if scene.time_step > limits[what] * (1 + 1e-6):
             steps = int(np.ceil(scene.frame_step / limits[what]))
             remedy = (f"above the limit {limits[what]:.4g} s, which {what} sets (cfl {scene.cfl:g}, speed {speed:.3g} m/s); use at most "
@@ -571,7 +586,6 @@ class SPHSimulator:
         gravity = float(np.linalg.norm(np.array(scene.gravity) - scene.acceleration(), axis=1).max())
         start = float(np.sqrt((particles.velocity**2).sum(1).max()))
         fall = float(np.sqrt(start**2 + 2 * gravity * np.linalg.norm(np.ptp(scene.bounds, axis=1))))
-        water = self._water(scene)
         return {
             "title": {"wcsph": "weakly compressible SPH", "dfsph": "divergence-free SPH"}[method], "dim": dim, "rates": [method],
             "materials": [material.model for material in scene.materials.values()],
@@ -581,7 +595,7 @@ class SPHSimulator:
             "fields": fields,
             "left_out": {what: why for what, why in reasons.items() if why}, "bytes": sum(size * count for size, count in fields.values()),
             "particles": len(particles.position), "recorded": len(particles.tracked) + len(scene.boundary), "kinematic": len(scene.boundary),
-            "cells": cells.tolist(), "grid_spacing": support * (1 + SKIN), "wave_speed": water.sound_speed if method == "wcsph" else 0.0,
+            "cells": cells.tolist(), "grid_spacing": support * (1 + SKIN), "wave_speed": _sound(self._water(scene)) if method == "wcsph" else 0.0,
             "substeps_per_frame": [self._substeps(scene, speed + gravity * scene.frame_step) for speed in (0.0, fall)],
         }
 
@@ -723,7 +737,7 @@ class SPHSimulator:
             what = ", ".join(f"{what} {report[k.ERROR + which]:.2g}" for which, what in enumerate(("divergence", "density")))
             what = f"viscosity did not converge in {{}} iterations ({report[k.VISCOUS]:.2g})" if report[k.VISCOUS] > VISCOUS_ERROR else (
                 f"pressures did not converge in {{}} iterations ({what})")  # fmt: skip
-            return f"{what.format(scene.solver.iterations)}, at a step of {report[k.LAST]:.3g} s"
+            return f"{what.format(getattr(scene.solver, 'iterations', None))}, at a step of {report[k.LAST]:.3g} s"
         if fixed and report[k.LIMIT] < floor:
             return f"the fixed time step {fixed:.3g} s is far above the limit {report[k.LIMIT]:.3g} s at a speed of {speed:.3g} m/s"
         if fixed:

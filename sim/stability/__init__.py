@@ -7,6 +7,7 @@ Cases run their scenes by ``sim.stability.driver``, on 16 x 16 cells with rough 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -39,6 +40,6 @@ class Cell:
     right: bool
     expected: str
     observed: str
-    numbers: dict[str, float | str | None]
+    numbers: Mapping[str, float | str | None]
     seconds: float
     curves: dict[str, Series] = field(default_factory=dict)

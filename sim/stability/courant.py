@@ -9,7 +9,7 @@ from sim.validation import scene
 COURANT = (0.2, 0.4, 0.8, 1.2, 2.0, 2.8, 4.0)
 #: In 3D, where a run takes longer.
 COURANT_3D, FRAMES = (0.4, 1.2, 4.0), {2: 100, 3: 50}
-MATERIALS = {
+MATERIALS: dict[str, dict] = {
     "water": {"model": "water", "sound_speed": 20.0},
     "sand": {"model": "sand", "young_modulus": 3e5, "friction_angle": 30.0},
     "goop": {"model": "goop", "young_modulus": 2e5, "yield_stress": 2e3},
@@ -38,5 +38,7 @@ def _drop(name: str, material: dict, courant: float, dim: int) -> Cell:
     growth = run.growth(scale)
     right = growth <= BOUND - 1 or not run.ok
     observed = f"energy at most {1 + growth:.3g} of the start's" if run.ok else run.status
-    numbers = {"dim": dim, "courant": courant, "energy_growth": growth, "smallest_dt": float(run.dt.min(initial=1.0)), "status": run.status}
+    numbers: dict[str, float | str | None] = {
+        "dim": dim, "courant": courant, "energy_growth": growth, "smallest_dt": float(run.dt.min(initial=1.0)), "status": run.status,
+    }
     return Cell("courant", cell, right, EXPECTED, observed, numbers, time.perf_counter() - begun, {cell: run.energy_curve(scale)})

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from sim.generate import Teacher
 from sim.scene import Scene
 from sim.simulator import SimulationError
 from sim.solvers import solver_class
@@ -15,9 +15,10 @@ from sim.stability import Series
 #: Walls of most scenes: one set of kernels a material.
 ROUGH = {"friction": 0.5}
 #: Water of the other methods, as a material of ``scene`` by name; SPH has slip walls.
-SPH = {"wcsph": {"model": "water", "sound_speed": 20.0}, "dfsph": {"model": "water"}}
-PBF = {"pbf": {"model": "water"}}
-_solvers: dict[str, Teacher] = {}
+SPH: dict[str, dict] = {"wcsph": {"model": "water", "sound_speed": 20.0}, "dfsph": {"model": "water"}}
+PBF: dict[str, dict] = {"pbf": {"model": "water"}}
+#: Any: cases ask a solver for what its method alone has.
+_solvers: dict[str, Any] = {}
 
 
 def way(name: str) -> dict:
@@ -56,6 +57,7 @@ class Run:
 
     @property
     def ok(self) -> bool:
+        """Whether it ran to its end."""
         return self.status == "ok"
 
     def growth(self, scale: float) -> float:
@@ -63,10 +65,11 @@ class Run:
         return float((self.energy.max() - self.energy[0]) / scale)
 
     def energy_curve(self, scale: float) -> Series:
+        """Energy over what there is to release, less what the start has beyond it."""
         return Series(("time [s]", "energy / energy at hand"), np.concatenate([[0.0], self.time]), (self.energy - self.energy[0]) / scale + 1)
 
 
-def solver_for(what: Scene) -> Teacher:
+def solver_for(what: Scene) -> Any:
     """The solver that all scenes of this structure and grid share in a process: compiling one takes longer than most cells."""
     solver = solver_class(what.solver.method)()
     key = repr((solver.plan(what)["cells"], solver._structure(what)))

@@ -12,7 +12,7 @@ from sim.stability.refusal import FAMILY
 from sim.validation import scene
 
 CELLS, G, FRAME = 16, 9.8, 0.005
-WATER = {"water": {"model": "water", "sound_speed": 20.0}} | SPH | PBF
+WATER: dict[str, dict] = {"water": {"model": "water", "sound_speed": 20.0}} | SPH | PBF
 #: Of positions, as 33 cells in float32 round them, some hundred steps.
 ROUNDING = 1e-4
 

@@ -9,7 +9,7 @@ from sim.stability import Cell
 from sim.stability.driver import PBF, SPH, deep, follow, solver_for, way
 from sim.validation import scene
 
-MATERIALS = {
+MATERIALS: dict[str, dict] = {
     "water": {"model": "water", "sound_speed": 20.0},
     "sand": {"model": "sand", "young_modulus": 3e5, "friction_angle": 30.0},
     "elastic": {"model": "elastic", "young_modulus": 1e7},

@@ -35,26 +35,27 @@ def outcome(run: Run, scale: float) -> str:
 
 def map_cell(case: str, cell: str, what: Scene, bound: float, frames: int, numbers: dict, prepare=None) -> Cell:
     """One cell: ``what`` has a fixed ``time_step``; ``bound``: the limit by hand [s]."""
-    begun, solver = time.perf_counter(), solver_for(what)
+    begun, solver, step = time.perf_counter(), solver_for(what), what.time_step
+    assert step is not None
     try:
         solver.load(what)
         refused = ""
     except InputError as error:
         refused = str(error)
     if refused:
-        solver.unguarded_step = what.time_step
+        solver.unguarded_step = step
         run = follow(what, frames, prepare)
         solver.unguarded_step = None
         free = outcome(run, run.energy[0])
-        right = what.time_step > bound and f"{bound:.4g} s" in refused
+        right = step > bound and f"{bound:.4g} s" in refused
         observed = f"refused; run all the same, its energy was {free}" if free != "not finite" else "refused; run all the same, it was not finite"
     else:
         run = follow(what, frames, prepare)
         free = outcome(run, run.energy[0])
-        right = what.time_step <= bound * (1 + 1e-6) and free != "grew"
+        right = step <= bound * (1 + 1e-6) and free != "grew"
         observed = {"bounded": "bounded", "grew": "accepted, and its energy grew", "not finite": run.status}[free]
     growth = run.growth(run.energy[0])
-    numbers = numbers | {"time_step": what.time_step, "limit": bound, "refused": bool(refused), "outcome": free, "energy_growth": growth}
+    numbers = numbers | {"time_step": step, "limit": bound, "refused": bool(refused), "outcome": free, "energy_growth": growth}
     return Cell(case, cell, right, EXPECTED, observed, numbers, time.perf_counter() - begun)
 
 

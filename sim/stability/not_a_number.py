@@ -27,7 +27,8 @@ STATES = {
 class Poisoned:
     """A teacher that writes ``value`` into a particle before frame ``WHEN``."""
 
-    name, kind, settings, compile_seconds = "poisoned", "solver", {}, 0.0
+    name, kind, compile_seconds = "poisoned", "solver", 0.0
+    settings: dict = {}
     where, value = "velocity", np.nan
 
     def load(self, scene) -> None:

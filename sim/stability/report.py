@@ -53,7 +53,7 @@ def row(cell: Cell) -> dict:
 
 def title(case: str) -> str:
     """First line of a case's docstring."""
-    return importlib.import_module(f"sim.stability.{case}").__doc__.splitlines()[0].rstrip(".")
+    return (importlib.import_module(f"sim.stability.{case}").__doc__ or case).splitlines()[0].rstrip(".")
 
 
 def onset(rows: Sequence[Mapping]) -> float:

@@ -32,6 +32,7 @@ FAMILIES |= {f"{name}, two bodies, ": FAMILY | AMONG | {"obstacles": [], "materi
 
 
 def run() -> list[Cell]:
+    """Killed at a random instant and resumed, for every family of scenes."""
     return [_killed(of, family) for of, family in FAMILIES.items()]
 
 

@@ -39,7 +39,7 @@ def run() -> list[Cell]:
             what = scene("runaway", SPH[name], [body], [[0.0, 1.0]] * 2, [CELLS] * 2, FRAME, gravity=[0.0, -G], solver={"method": name})
             what = deep(what, 0.0, 0.25) if dim == 3 else what
             follow(what, WHEN)
-            spent = []
+            spent: list[float] = []
 
             def watch(solver, spent=spent, fault=fault) -> None:
                 spent.append(time.perf_counter())

@@ -11,7 +11,7 @@ from sim.stability.command_line import command
 from sim.stability.refusal import FAMILY
 
 BODY = {"material": "stuff", "shape": {"kind": "box", "size": [0.3, 0.3]}, "center": [0.5, 0.5]}
-STARTS = {
+STARTS: dict[str, tuple[dict, str]] = {
     "two bodies in one place": ({"bodies": [BODY, BODY]}, "overlapping another body"),
     "two bodies that share a corner": ({"bodies": [BODY, BODY | {"center": [0.75, 0.75]}]}, "overlapping another body"),
     "a body in an obstacle": (

@@ -11,7 +11,9 @@ from sim.validation import scene
 
 CELLS, G, FRAME, SHAKE = 16, 9.8, 0.002, 98.0
 #: Five times the speed that the shaken box gives.
-WATER = {"water": {"model": "water", "sound_speed": 20.0}, "wcsph": SPH["wcsph"] | {"sound_speed": 80.0}, "dfsph": SPH["dfsph"]} | PBF
+WATER: dict[str, dict] = {
+    "water": {"model": "water", "sound_speed": 20.0}, "wcsph": SPH["wcsph"] | {"sound_speed": 80.0}, "dfsph": SPH["dfsph"],
+} | PBF
 #: Of positions in float32, as 33 cells in a random walk of some hundred steps round them.
 ROUNDING = 1e-4
 
@@ -23,6 +25,7 @@ def _shaken(name: str, bodies: list[dict], frequency: float, phase: float, **cha
 
 
 def run() -> list[Cell]:
+    """A shaken box of every method."""
     return [cell for name in WATER for cell in _shake(name, "" if name == "water" else f"{name}, ")]
 
 

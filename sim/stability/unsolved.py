@@ -36,7 +36,7 @@ def _column(dim: int, step: float | None) -> Cell:
         # Shorter steps ask less of each: a frame that passes has to be as good as any.
         right, expected = said or (run.ok and max(worst) <= 10 * ERROR), "failed for pressures that did not converge, or density as it should be"
     observed = f"mean density error at most {max(worst):.2g} by the particles' places" if run.ok else run.status
-    numbers = {"frames": len(run.time), "density_error": max(worst, default=np.nan), "status": run.status}
+    numbers: dict[str, float | str | None] = {"frames": len(run.time), "density_error": max(worst, default=np.nan), "status": run.status}
     return Cell("unsolved", cell, right, expected, observed, numbers, time.perf_counter() - begun)
 
 

@@ -38,6 +38,7 @@ class Curve:
 
     @property
     def passed(self) -> bool:
+        """Whether the error is within the tolerance."""
         return bool(abs(self.error) <= self.tolerance)
 
 

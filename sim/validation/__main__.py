@@ -1,3 +1,5 @@
+"""``python -m sim.validation``: see ``sim.validation.ladder``."""
+
 import sys
 
 from sim.validation.ladder import main

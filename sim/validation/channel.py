@@ -28,7 +28,9 @@ def run(resolution: int, method: str) -> Outcome:
     curves, total = {}, 0.0
     for name, exact in (("Poiseuille", poiseuille), ("Couette", couette)):
         found, seconds, particles = _flow(resolution, method, name)
-        y, ours, error = [], [], 0.0
+        y: list[np.ndarray] = []
+        ours: list[np.ndarray] = []
+        error = 0.0
         layers = (np.arange(resolution) + 0.5) / resolution
         for index, time in enumerate(TIMES):
             position, velocity = found[FRAMES[index] - 1]

@@ -74,7 +74,9 @@ def figure(title: str, found: dict[str, list[Outcome]], path: Path) -> None:
     canvas = Figure(figsize=(9, 2.9 * len(names) + 0.5), layout="constrained")
     panels = canvas.subplots(len(names), 2, width_ratios=[1.4, 1], squeeze=False)
     for (left, right), name in zip(panels, names, strict=True):
-        times, sizes, last = [], [], None
+        times: list[float] = []
+        sizes: list[float] = []
+        last = next(outcomes[-1].curves[name] for outcomes in reversed(found.values()) if name in outcomes[-1].curves)
         for (method, outcomes), color in zip(found.items(), ("C0", "C1", "C2", "C4"), strict=False):
             if name not in outcomes[-1].curves:
                 continue
@@ -82,7 +84,6 @@ def figure(title: str, found: dict[str, list[Outcome]], path: Path) -> None:
             for outcome, curve, shade in zip(outcomes, curves, np.linspace(0.3, 1, len(curves)), strict=True):
                 marked = ".-" if len(curve.x) < 300 else "-"
                 left.plot(curve.x, curve.ours, marked, ms=3, lw=1, color=color, alpha=shade, label=f"{method} {outcome.resolution}")
-            last = curves[-1]
             seconds, errors = [max(outcome.seconds, 1e-3) for outcome in outcomes], [abs(curve.error) for curve in curves]
             right.plot(seconds, errors, "o-", color=color)
             for outcome, *place in zip(outcomes, seconds, errors, strict=True):
@@ -108,19 +109,20 @@ def page(found: dict[str, dict[str, list[Outcome | str]]], folder: Path, version
     rows, sections, missed = [], [], []
     for case, by_method in found.items():
         what = module(case)
-        title = what.__doc__.splitlines()[0].rstrip(".")
-        lines, drawn = [f'<a id="{case}"></a>', f"## {what.NUMBER}. {title}", "", inspect.getdoc(what.run), ""], {}
+        title = (what.__doc__ or case).splitlines()[0].rstrip(".")
+        lines, drawn = [f'<a id="{case}"></a>', f"## {what.NUMBER}. {title}", "", inspect.getdoc(what.run) or "", ""], {}
         for method, results in by_method.items():
             outcomes = [each for each in results if isinstance(each, Outcome)]
             if len(outcomes) < len(results) or not all(curve.passed for curve in outcomes[-1].curves.values()):
                 missed.append(f"{title.split(':')[0]} ({method})")
             seconds = " / ".join(f"{each.seconds:.1f}" if isinstance(each, Outcome) else "-" for each in results)
             for name in outcomes[-1].curves if outcomes else ["-"]:
-                curves = [each.curves[name] if isinstance(each, Outcome) else None for each in results]
-                errors = " / ".join("failed" if curve is None else f"{curve.error:.2g}" for curve in curves)
-                passed = curves[-1] is not None and None not in curves and curves[-1].passed
-                rate = "-" if None in curves else f"{order(what.RESOLUTIONS, [curve.error for curve in curves]):.1f}"
-                tolerance = "-" if curves[-1] is None else f"{curves[-1].tolerance:g}"
+                curves = [each.curves[name] for each in outcomes]
+                errors = " / ".join(f"{each.curves[name].error:.2g}" if isinstance(each, Outcome) else "failed" for each in results)
+                whole, last = len(curves) == len(results), results[-1]
+                passed = whole and curves[-1].passed
+                rate = f"{order(what.RESOLUTIONS, [curve.error for curve in curves]):.1f}" if whole else "-"
+                tolerance = f"{last.curves[name].tolerance:g}" if isinstance(last, Outcome) else "-"
                 head = [str(what.NUMBER), f"[{title.split(':')[0]}](#{case})", method, name]
                 rows.append("| " + " | ".join([*head, errors, tolerance, "yes" if passed else "**no**", rate, seconds]) + " |")
             for resolution, each in zip(what.RESOLUTIONS, results, strict=True):

@@ -48,8 +48,8 @@ def turn(solver, resolution: int, method: str) -> tuple[np.ndarray, np.ndarray, 
 
     before = np.array(observe())
     found, seconds = timed(solver.frame, TURN, observe)
-    found = np.array(found)
-    return found[:, 0] / before[0] - 1, np.linalg.norm(found[:, 1:] - before[1:], axis=1), seconds
+    seen = np.array(found)
+    return seen[:, 0] / before[0] - 1, np.linalg.norm(seen[:, 1:] - before[1:], axis=1), seconds
 
 
 def fall(solver, resolution: int, method: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:

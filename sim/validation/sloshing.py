@@ -3,6 +3,7 @@
 import numpy as np
 from scipy.spatial import cKDTree
 
+from sim.scene import Incompressible
 from sim.sph.kernel import kernel, lattice_scale, wall_table
 from sim.sph.solver import SPHSimulator
 from sim.validation import Curve, Outcome, scene, timed
@@ -26,6 +27,7 @@ def run(resolution: int, method: str) -> Outcome:
         "sloshing", {"model": "water"}, [{"kind": "box", "lower": [0.0, 0.0], "upper": [L, L]}], [[0.0, 3 * L], [0.0, 1.0]],
         [3 * resolution, round(1.0 / L * resolution)], 0.01, gravity=[0.0, -G], particles_per_cell=1, solver={"method": method},
     )  # fmt: skip
+    assert isinstance(what.solver, Incompressible)
     solver = SPHSimulator()
     solver.load(what)
     found, seconds = timed(

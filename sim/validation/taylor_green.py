@@ -3,6 +3,7 @@
 import numpy as np
 from scipy.spatial import cKDTree
 
+from sim.scene import WeaklyCompressible
 from sim.solvers import solver_class
 from sim.sph.kernel import kernel, lattice_scale
 from sim.validation import Curve, Outcome, scene, timed
@@ -35,6 +36,7 @@ def run(resolution: int, method: str) -> Outcome:
     velocity = np.stack([-np.cos(x) * np.sin(y), np.sin(x) * np.cos(y)], 1)
     if method == "wcsph":
         # Shifting evens the lattice out and takes what the sum over the kernel loses by it from the density, which is to end at one.
+        assert isinstance(what.solver, WeaklyCompressible)
         support, tree = what.solver.support * what.spacing, cKDTree(what.particles().position, boxsize=1.0)
         near = tree.sparse_distance_matrix(tree, support, output_type="coo_matrix").data / support
         uneven = kernel(2, near).sum() * lattice_scale(2, 1 / what.solver.support) / what.solver.support**2 / len(x)

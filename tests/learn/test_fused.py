@@ -18,7 +18,7 @@ from textbook_gns import TextbookNetwork
 
 from learn import fused
 from learn.dataset import DataSpec, Windows
-from learn.gns import Network, Settings
+from learn.gns import GNSSettings, Network
 from learn.graph import Graph, radius_graph
 from learn.model import build
 from learn.replay import RolloutReplay, TrainingReplay
@@ -69,7 +69,7 @@ def test_network_and_gradient_against_the_textbook(dim, latent, edge_update, mon
     position, example = torch.rand(24, dim), torch.arange(24) // 12
     _, graph = padded(position, example, 0.4, True, 300)
     count = int(graph.count)
-    network = Network(Settings(latent=latent, message_passing=2, edge_update=edge_update), 7, dim + 1, dim)
+    network = Network(GNSSettings(latent=latent, message_passing=2, edge_update=edge_update), 7, dim + 1, dim)
     for parameter in network.parameters():
         if parameter.ndim == 1:
             torch.nn.init.normal_(parameter, std=0.3)  # biases and LayerNorms start at values that hide what is left out
@@ -298,7 +298,7 @@ def test_what_clumps_ends_and_the_others_go_on(replaying):
 
 
 def test_what_the_kernels_are_made_for():
-    assert fused.supports(Network(Settings(latent=64), 7, 3, 2))
+    assert fused.supports(Network(GNSSettings(latent=64), 7, 3, 2))
     for changes in ({"latent": 48}, {"hidden_layers": 3}, {"encoder": "absolute"}):
-        assert not fused.supports(Network(Settings(**{"latent": 64} | changes), 7, 3, 2))
+        assert not fused.supports(Network(GNSSettings(**{"latent": 64} | changes), 7, 3, 2))
     assert not build("gns", SETTINGS | {"precision": "bf16"}, spec_of()).replayable  # on a CPU

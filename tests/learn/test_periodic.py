@@ -15,7 +15,7 @@ from learn.baselines import ConstantVelocity, Oracle, RigidDrop, trivial_baselin
 from learn.checkpoint import build_model
 from learn.dataset import Dataset, DataSpec
 from learn.features import Features
-from learn.gns import GNS, Settings
+from learn.gns import GNS, GNSSettings
 from learn.graph import radius_graph
 from learn.model import build
 from learn.relaxation import Relaxation, relax
@@ -51,7 +51,7 @@ def flow(frames=30, particles=12, seed=0, shift=0.0, kinds=None, drift=0.3):
 
 def small(data=None, **options) -> GNS:
     torch.manual_seed(0)
-    return GNS(Settings(**(dict(latent=16, message_passing=2, history=3, noise=0.0) | options)), data or spec()).eval()
+    return GNS(GNSSettings(**(dict(latent=16, message_passing=2, history=3, noise=0.0) | options)), data or spec()).eval()
 
 
 # --- graph and features ----------------------------------------------------------------------------------------------

@@ -9,6 +9,8 @@ On the host it says what it is: ``state``, ``fields``, ``numbers``, ``options`` 
 and ``omissions`` (by the numbers), ``rest_wave_speed``, and two bounds on dt beside the Courant number's: ``largest_step``, ``rings``.
 """
 
+from typing import Any
+
 from sim.mpm.materials.elastic import ElasticModel
 from sim.mpm.materials.goop import GoopModel
 from sim.mpm.materials.rigid import RigidModel
@@ -16,6 +18,7 @@ from sim.mpm.materials.sand import SandModel
 from sim.mpm.materials.snow import SnowModel
 from sim.mpm.materials.water import WaterModel
 
-MODELS = {
+#: name -> class. Any: a contract of Taichi functions, which no protocol describes.
+MODELS: dict[str, Any] = {
     "water": WaterModel, "sand": SandModel, "goop": GoopModel, "elastic": ElasticModel, "snow": SnowModel, "rigid": RigidModel,
 }

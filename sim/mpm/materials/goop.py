@@ -38,6 +38,7 @@ class GoopModel(Principal):
 
     @ti.func
     def return_map(self, p, e, dt):
+        """Back along the deviator to the yield surface, or to the overstress of the viscosity; the volume stays."""
         limit, mean = self.parameters[3], e.sum() / self.dim
         dev = e - mean
         size = dev.norm()

@@ -54,6 +54,7 @@ class RigidModel:
 
     @ti.func
     def reset(self, p):
+        """A body has no state a particle."""
         pass
 
     @ti.func

@@ -39,10 +39,12 @@ class SnowModel(Principal):
 
     @ti.func
     def hardening(self, p):
+        """h = exp(xi (1 - J_P))."""
         return ti.exp(self.parameters[3] * (1.0 - self.J[p]))
 
     @ti.func
     def return_map(self, p, e, dt):
+        """Elastic log stretches cut to [log(1 - theta_c), log(1 + theta_s)]; J_P takes what is cut off."""
         result = ti.min(ti.max(e, self.parameters[4]), self.parameters[5])
         cut = e.sum() - result.sum()
         moved = (e - result).norm_sqr() > 0.0

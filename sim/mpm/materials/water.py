@@ -45,6 +45,7 @@ class WaterModel:
 
     @staticmethod
     def rest_wave_speed(material, stiffness: float) -> float:
+        """The speed of sound [m/s]."""
         return material.sound_speed * float(np.sqrt(stiffness))
 
     @staticmethod
