@@ -198,6 +198,7 @@ def program(folder: Path, code: str, **environment: str) -> subprocess.Completed
     for name in ("tiles.py", "tiles.cpp"):
         (folder / "learn" / name).write_bytes((tiles.SOURCE.parent / name).read_bytes())
     (folder / "learn" / "graph.py").write_text("class Graph: ...")
+    (folder / "learn" / "__init__.py").touch()  # a package like the checkout's, so that the first of the two is it
     whole = "import warnings, torch; from pathlib import Path; from learn import tiles; warnings.simplefilter('always')\n" + code
     return subprocess.run([sys.executable, "-c", whole], cwd=folder, env=os.environ | environment, capture_output=True, text=True, check=False)
 
