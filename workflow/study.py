@@ -318,6 +318,10 @@ def _check_comparison(study: Study, name: str, entry: dict) -> None:
             raise InputError(path, f"{where}.ladder[{index}].name", rung["name"], "another contender has this name; rename the rung")
         if rung.get("coarsen", 1) != 1 and rung.get("particles") != "recorded":
             raise InputError(path, f"{where}.ladder[{index}].coarsen", rung["coarsen"], "a coarser grid needs particles: recorded")
+        finer, refine = rung.get("particles"), study.families[entry["data"]].model.refine
+        if isinstance(finer, int) and finer > refine:
+            remedy = f"finer than the teacher's, which are refined {refine} times; use teacher or a smaller number"
+            raise InputError(path, f"{where}.ladder[{index}].particles", finer, remedy)
     for axis, models in entry["axes"].items():
         for model in models:
             if model not in entry["learned"]:

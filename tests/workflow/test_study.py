@@ -93,6 +93,8 @@ MISTAKES = [
     (put(*COMPARISON, "ladder", 0, "name", value="frozen"), "comparisons.puddle.ladder[0].name = 'frozen': another contender has this name"),
     (put(*COMPARISON, "ladder", 0, value={"name": "a"}), "comparisons.puddle.ladder[0] = ['name']: name what the rung changes"),
     (put(*COMPARISON, "ladder", 0, value={"name": "a", "coarsen": 2.0}), "comparisons.puddle.ladder[0].coarsen = 2.0: a coarser grid needs"),
+    (put(*COMPARISON, "ladder", 0, value={"name": "a", "particles": 1}), "comparisons.puddle.ladder[0].particles = 1: must be teacher, recorded or"),
+    (put(*COMPARISON, "ladder", 0, value={"name": "a", "particles": 9}), "comparisons.puddle.ladder[0].particles = 9: finer than the teacher's"),
     (put(*COMPARISON, "ladder", 0, "cfl", value=0), "comparisons.puddle.ladder[0].cfl = 0"),
     (put(*COMPARISON, "targets", 0, "metric", value="beauty"), "comparisons.puddle.targets[0].metric = 'beauty'"),
     (drop(*COMPARISON, "targets", 0, "high"), "give contender, metric and at least one of high and low"),
