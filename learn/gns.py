@@ -112,8 +112,10 @@ class MLP(nn.Module):
 
     def tiled(self, dtype: torch.dtype) -> bool:
         """Whether ``tiles.mlp`` can take this: for rollouts, which need no gradient."""
-        latent = self.linears[-1].out_features
-        return self.norm is not None and not torch.is_grad_enabled() and tiles.supports(latent, len(self.linears) - 1, dtype, self.linears[0].weight)
+        widths, weight = {linear.out_features for linear in self.linears}, self.linears[0].weight
+        if self.norm is None or len(widths) > 1 or torch.is_grad_enabled():
+            return False
+        return tiles.supports(widths.pop(), len(self.linears) - 1, dtype, weight)
 
     def tiles(self, inputs: list[Tensor], dtype: torch.dtype, out: Tensor, residual: bool = False) -> Tensor:
         """``tiles.mlp`` of this."""
@@ -124,7 +126,7 @@ class MLP(nn.Module):
     def forward(self, x: Tensor, dtype: torch.dtype) -> Tensor:
         """[rows, inputs] -> [rows, outputs], products in ``dtype``, the result in the parameters' type."""
         if self.tiled(dtype):
-            return self.tiles([x], dtype, x.new_empty(len(x), self.linears[-1].out_features))
+            return self.tiles([x], dtype, self.linears[0].weight.new_empty(len(x), self.linears[-1].out_features))
         return self.finish(_linear(x, self.linears[0].weight, self.linears[0].bias, dtype), dtype)
 
     def finish(self, x: Tensor, dtype: torch.dtype) -> Tensor:

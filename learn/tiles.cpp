@@ -221,6 +221,7 @@ void forward(const Forward& f) {
         T* to = in + row * wide;
         for (int part = 0; part < 2; ++part)
           for (int k = 0; k < f.widths[part]; ++k) put(to++, f.inputs[part][(start + row) * f.widths[part] + k]);
+        if (depth < even<T>(depth)) put(to, 0.f);  // what an earlier tile left there may be no number
       }
     }
     auto begin_edges = [&](int row, int column, Sums& sums) {

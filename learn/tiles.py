@@ -14,10 +14,12 @@ numbers of threads.
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import hashlib
 import os
 import platform
+import shlex
 import shutil
 import subprocess
 import tempfile
@@ -68,32 +70,31 @@ class _Backward(ctypes.Structure):
 @cache
 def build() -> ctypes.CDLL | None:
     """The kernels, from ``.kernel_cache`` or compiled into it; None, with a warning, where that cannot be done."""
-    compiler = next((found for name in (os.environ.get("CXX"), "c++", "g++", "clang++") if name and (found := shutil.which(name))), None)
+    named = shlex.split(os.environ.get("CXX", ""))
+    compiler = named or next(([name] for name in ("c++", "g++", "clang++") if shutil.which(name)), None)
     if compiler is None:
         warnings.warn("no C++ compiler (c++, g++, clang++, or CXX in the environment): a GNS goes the slower way on this CPU", stacklevel=2)
         return None
-    version = subprocess.run([compiler, "--version"], capture_output=True, check=False).stdout
-    key = hashlib.sha256(b"\0".join([SOURCE.read_bytes(), " ".join(FLAGS).encode(), version, _processor()])).hexdigest()[:16]
-    place = SOURCE.parent.parent / ".kernel_cache"
-    folder: Path | None = place
     try:
-        place.mkdir(exist_ok=True)
-    except OSError:
-        folder = None
-    library = folder / f"tiles-{key}.so" if folder else None
-    try:
-        if library is None or not library.exists():
-            with tempfile.TemporaryDirectory(dir=folder) as scratch:
-                made = Path(scratch) / "tiles.so"
-                subprocess.run([compiler, *FLAGS, str(SOURCE), "-o", str(made)], capture_output=True, check=True, text=True)
-                if library is None:
-                    return _declared(ctypes.CDLL(str(made)))
-                os.replace(made, library)  # whoever builds at the same time builds the same
-        return _declared(ctypes.CDLL(str(library)))
+        version = subprocess.run([*compiler, "--version"], capture_output=True, check=True, text=True).stdout.encode()
+        key = hashlib.sha256(b"\0".join([SOURCE.read_bytes(), " ".join(FLAGS).encode(), version, _processor()])).hexdigest()[:16]
+        place = SOURCE.parent.parent / ".kernel_cache"
+        library = place / f"tiles-{key}.so"
+        if library.exists():
+            return _declared(ctypes.CDLL(str(library)))
+        with contextlib.suppress(OSError):
+            place.mkdir(exist_ok=True)
+        kept = os.access(place, os.W_OK)  # an installation may be another user's: then every process builds its own
+        with tempfile.TemporaryDirectory(dir=place if kept else None) as scratch:
+            made = Path(scratch) / "tiles.so"
+            subprocess.run([*compiler, *FLAGS, str(SOURCE), "-o", str(made)], capture_output=True, check=True, text=True)
+            if kept:
+                made = made.replace(library)  # whoever builds at the same time builds the same
+            return _declared(ctypes.CDLL(str(made)))
     except (OSError, subprocess.CalledProcessError) as error:
         reason = (getattr(error, "stderr", None) or str(error)).strip().splitlines()
         why = reason[0] if reason else error
-        warnings.warn(f"{compiler} did not build {SOURCE.name} ({why}): a GNS goes the slower way on this CPU", stacklevel=2)
+        warnings.warn(f"{' '.join(compiler)} did not build {SOURCE.name} ({why}): a GNS goes the slower way on this CPU", stacklevel=2)
         return None
 
 
@@ -119,7 +120,7 @@ def supports(latent: int, layers: int, dtype: torch.dtype, weight: Tensor) -> bo
     """Whether the kernels take an MLP of this width, with so many layers after the first, products in ``dtype``, this weight [outputs, inputs]."""
     if weight.device.type != "cpu" or weight.dtype != torch.float32 or dtype not in (torch.float32, torch.bfloat16):
         return False
-    if layers > MOST or latent > WIDEST or (library := build()) is None:
+    if not 1 <= layers <= MOST or latent > WIDEST or (library := build()) is None:
         return False
     return latent % library.width() == 0 and (dtype == torch.float32 or bool(library.multiplies_bf16()))
 
@@ -214,10 +215,10 @@ def mlp(
 ) -> Tensor:
     """LayerNorm(MLP[inputs]), products in ``dtype``, for every row, into ``out`` or, with ``residual``, added to it; no gradient.
 
-    inputs: one or two of [rows, width] float32, side by side; linears: weight, bias of every layer; norm: gamma, beta, epsilon; out [rows, latent],
+    inputs: one or two of [rows, width], side by side; linears: weight, bias of every layer; norm: gamma, beta, epsilon; out [rows, latent],
     float32 or, without ``residual``, ``dtype``.
     """
-    inputs = [values.contiguous() for values in inputs]
+    inputs = [values.float().contiguous() for values in inputs]
     (first, bias), *rest = linears
     rows, wide = len(out), out.dtype == torch.float32
     widths = [values.shape[1] for values in inputs]

@@ -133,9 +133,12 @@ def test_rows_of_features(dtype, widths):
         found = module.tiles(inputs, dtype, torch.empty(101, 64))
         added = module.tiles(inputs, dtype, base.clone(), residual=True)
         narrow = module.tiles(inputs, dtype, torch.empty(101, 64, dtype=dtype))
+        others = [module(torch.cat(inputs, 1).to(given), dtype) for given in (torch.float64, torch.bfloat16)]
     most = 1e-6 if dtype == torch.float32 else 1e-2
     assert relative(found, wanted) < most and relative(narrow, wanted) < most
     assert (added - base - found).abs().max() < 1e-6
+    # Inputs of any type; the result has the parameters'.
+    assert all(other.dtype == torch.float32 and relative(other, wanted) < 2e-2 for other in others)
 
 
 @pytest.mark.parametrize("dtype", PRECISIONS)
@@ -174,6 +177,18 @@ def test_what_is_not_a_number_stays_visible(dtype):
     assert torch.equal(sums.isnan().any(1), broken) and updated.isnan().any(1).nonzero().flatten().tolist() == [3]
 
 
+@pytest.mark.parametrize("dtype", PRECISIONS)
+@pytest.mark.parametrize("width", [36, 37])
+def test_what_is_not_a_number_stays_in_its_row(dtype, width):
+    """Also where a width is odd, and pairs of bfloat16 are filled up."""
+    if not supported(dtype):
+        pytest.skip("this processor does not multiply bfloat16")
+    module, inputs = gns.MLP(width, 64, 2, 64), torch.randn(150, width)
+    inputs[3, 5] = torch.nan
+    with torch.inference_mode():
+        assert module(inputs, dtype).isnan().any(1).nonzero().flatten().tolist() == [3]
+
+
 def test_graph_without_edges():
     empty = torch.zeros(0, dtype=torch.int32)
     graph = Graph(empty, empty, torch.zeros(4, dtype=torch.int32))
@@ -187,7 +202,10 @@ def test_what_is_taken():
     assert tiles.supports(128, 2, torch.float32, weight) and tiles.supports(32, tiles.MOST, torch.float32, weight)
     assert not tiles.supports(128, 2, torch.float64, weight) and not tiles.supports(128, 2, torch.float32, weight.double())
     assert not tiles.supports(100, 2, torch.float32, weight) and not tiles.supports(1024, 2, torch.float32, weight)
-    assert not tiles.supports(128, tiles.MOST + 1, torch.float32, weight)
+    assert not tiles.supports(128, tiles.MOST + 1, torch.float32, weight) and not tiles.supports(128, 0, torch.float32, weight)
+    with torch.inference_mode():
+        assert gns.MLP(8, 64, 2, 64).tiled(torch.float32) and not gns.MLP(8, 32, 2, 64).tiled(torch.float32)
+        assert not gns.MLP(8, 64, 2, 64, norm=False).tiled(torch.float32)
     with pytest.raises(ValueError, match="in one piece"):
         tiles._pointer(torch.zeros(4, 4).t())
 
@@ -213,11 +231,30 @@ def test_without_a_compiler(tmp_path):
 
 def test_with_a_compiler_that_fails(tmp_path):
     broken = tmp_path / "broken"
-    broken.write_text("#!/bin/sh\necho 'no room' >&2; exit 1\n")
+    broken.write_text("#!/bin/sh\n[ \"$1\" = --version ] || { echo 'no room' >&2; exit 1; }\n")
     broken.chmod(0o755)
     found = program(tmp_path, BUILD, CXX=str(broken))
     assert found.stdout.split() == ["False"] and "did not build tiles.cpp (no room)" in found.stderr
     assert not list((tmp_path / ".kernel_cache").iterdir())  # nothing half-written
+
+
+@pytest.mark.parametrize("found", [b"", None])
+def test_with_a_compiler_that_cannot_be_run(tmp_path, found):
+    """A program that is none, and one that is not there: the one that was asked for is not replaced by another in silence."""
+    named = tmp_path / "compiler"
+    if found is not None:
+        named.write_bytes(found)
+        named.chmod(0o755)
+        named.write_bytes(b"\x7fnone")
+    done = program(tmp_path, BUILD, CXX=f"{named} -v")
+    assert done.stdout.split()[0] == "False" and f"{named} -v did not build tiles.cpp" in done.stderr and "Traceback" not in done.stderr
+
+
+def test_where_nothing_can_be_kept(tmp_path):
+    """Beside an installation of another user's: built for the process alone."""
+    code = "import os; may = os.access; os.access = lambda place, *how: Path(place).name != '.kernel_cache' and may(place, *how)\n" + BUILD
+    done = program(tmp_path, code)
+    assert done.stdout.split() == ["True"] and not done.stderr, done.stderr
 
 
 def test_narrower_vectors_give_the_same(tmp_path):
