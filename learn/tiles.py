@@ -70,9 +70,8 @@ class _Backward(ctypes.Structure):
 @cache
 def build() -> ctypes.CDLL | None:
     """The kernels, from ``.kernel_cache`` or compiled into it; None, with a warning, where that cannot be done."""
-    named = shlex.split(os.environ.get("CXX", ""))
-    compiler = named or next(([name] for name in ("c++", "g++", "clang++") if shutil.which(name)), None)
-    if compiler is None:
+    compiler = shlex.split(os.environ.get("CXX", "")) or [name for name in ("c++", "g++", "clang++") if shutil.which(name)][:1]
+    if not compiler:
         warnings.warn("no C++ compiler (c++, g++, clang++, or CXX in the environment): a GNS goes the slower way on this CPU", stacklevel=2)
         return None
     try:

@@ -13,7 +13,7 @@ import json
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import yaml
@@ -28,6 +28,9 @@ from sim.fields import mistake as _mistake
 from sim.fields import sample as _sample
 from sim.obstacles import Obstacle, ObstacleFamily, boundary_particles, combine, outside, within
 from sim.trajectory import KINEMATIC_TYPE, PARTICLE_TYPES
+
+if TYPE_CHECKING:
+    from sim.simulator import Start
 
 #: Names of the splits, in the order that seeds count them.
 SPLITS = ("train", "valid", "test")
@@ -421,6 +424,12 @@ class _FamilyModel(_Physics):
         return self
 
 
+def check_particles(name: str, particles: str | int) -> None:
+    """Raise ``InputError`` unless this is a solver's setting ``particles``, see ``Scene.refinement``."""
+    if particles not in ("teacher", "recorded") and not (type(particles) is int and particles > 0):
+        raise InputError(name, "particles", particles, "must be teacher, recorded or how many times finer than those")
+
+
 @dataclass(frozen=True)
 class Particles:
     """position, velocity [n, dim] float64; material, body [n] (indices into the scene's materials and bodies), both one contiguous
@@ -542,6 +551,15 @@ class Scene(_Physics):
         position = own.position.copy()
         position[own.tracked] = recorded.position
         return dataclasses.replace(own, position=position)
+
+    @classmethod
+    def of(cls, start: Start) -> Scene:
+        """The scene a start is of. Raises ``InputError`` where its particles are not those of the file, in their order: another version's file."""
+        scene = cls.from_dict(start.scene)
+        if not np.array_equal(scene.particle_type(), start.particle_type):
+            remedy = "its particles are in another order than the scene's: written by an earlier version; generate the data set again"
+            raise InputError(scene.name, "particle_type", f"{len(start.particle_type)} particles", remedy)
+        return scene
 
     def refinement(self, particles: Literal["teacher", "recorded"] | int) -> int:
         """How much finer than the recorded ones a solver's particles are, by its setting ``particles``. Raises ``InputError``."""

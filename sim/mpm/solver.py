@@ -22,7 +22,7 @@ from sim.mpm.rigid import RigidBodies
 from sim.mpm.walls import solid, wall
 from sim.obstacles import THINNEST, combine
 from sim.rigid import body_table
-from sim.scene import Particles, Scene
+from sim.scene import Particles, Scene, check_particles
 from sim.signed_distance import between_nodes
 from sim.simulator import Kind, SimulationError, Start
 from sim.taichi_runtime import compiling, start_taichi, ti
@@ -816,8 +816,7 @@ class MPMSimulator:
     def __init__(self, *, name: str = "mpm", kind: Kind = "reference", cfl: float | None = None, stiffness: float = 1.0, coarsen: float = 1.0,
                  particles: str | int = "teacher", perturbation: float = 0.0, frames: int = 1, serial: bool | None = None,
                  unguarded_step: float | None = None):
-        if particles not in ("teacher", "recorded") and not (isinstance(particles, int) and particles > 0):
-            raise InputError(name, "particles", particles, "must be teacher, recorded or how many times finer than those")
+        check_particles(name, particles)
         if frames < 1:
             raise InputError(name, "frames", frames, "must be at least 1")
         if particles != "recorded" and coarsen != 1.0:
@@ -1187,7 +1186,7 @@ class MPMSimulator:
     # -- the Simulator contract
     def begin(self, start: Start) -> None:
         """Run the known frames from the scene's own start, so that the solver stands where the history ends."""
-        self.load(Scene.from_dict(start.scene))
+        self.load(Scene.of(start))
         for _ in range(start.present):
             self.frame()
 

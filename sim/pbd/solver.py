@@ -55,7 +55,7 @@ import numpy as np
 from sim.errors import InputError
 from sim.mpm.decomposition import finite
 from sim.pbd.rigid import COLUMNS, Bodies, body_table
-from sim.scene import PositionBased, Scene
+from sim.scene import PositionBased, Scene, check_particles
 from sim.simulator import Kind, SimulationError, Start
 from sim.sph.kernel import ENTRIES, constant, kernel, lattice_relaxation, lattice_scale, wall_table
 from sim.sph.neighbours import ROOM, SKIN, Neighbours
@@ -497,8 +497,7 @@ class PBDSimulator:
 
     def __init__(self, *, name: str = "pbd", kind: Kind = "reference", cfl: float | None = None, particles: str | int = "teacher",
                  tolerance: float = 1.0, perturbation: float = 0.0):
-        if particles not in ("teacher", "recorded") and not (isinstance(particles, int) and particles > 0):
-            raise InputError(name, "particles", particles, "must be teacher, recorded or how many times finer than those")
+        check_particles(name, particles)
         self.name, self.kind = name, kind
         self.settings: dict[str, Any] = {"cfl": cfl, "particles": particles, "tolerance": tolerance, "perturbation": perturbation}
         self.compile_seconds = 0.0
@@ -722,7 +721,7 @@ class PBDSimulator:
     # -- the Simulator contract
     def begin(self, start: Start) -> None:
         """Run the known frames from the scene's own start, so that the solver stands where the history ends."""
-        self.load(Scene.from_dict(start.scene))
+        self.load(Scene.of(start))
         for _ in range(start.present):
             self.frame()
 

@@ -17,7 +17,7 @@ from sim.errors import InputError
 from sim.mpm.decomposition import finite
 from sim.obstacles import combine
 from sim.rigid import NO_SLIP, body_table
-from sim.scene import Incompressible, Particles, Scene, Water, WeaklyCompressible
+from sim.scene import Incompressible, Particles, Scene, Water, WeaklyCompressible, check_particles
 from sim.signed_distance import between_nodes
 from sim.simulator import Kind, SimulationError, Start
 from sim.sph.dfsph import DFSPH, VISCOUS_ERROR
@@ -398,8 +398,7 @@ class SPHSimulator:
 
     def __init__(self, *, name: str = "sph", kind: Kind = "reference", cfl: float | None = None, particles: str | int = "teacher",
                  tolerance: float = 1.0, stiffness: float = 1.0, perturbation: float = 0.0, unguarded_step: float | None = None):
-        if particles not in ("teacher", "recorded") and not (isinstance(particles, int) and particles > 0):
-            raise InputError(name, "particles", particles, "must be teacher, recorded or how many times finer than those")
+        check_particles(name, particles)
         self.name, self.kind = name, kind
         self.settings: dict[str, Any] = {
             "cfl": cfl, "particles": particles, "tolerance": tolerance, "stiffness": stiffness, "perturbation": perturbation,
@@ -805,7 +804,7 @@ class SPHSimulator:
     # -- the Simulator contract
     def begin(self, start: Start) -> None:
         """Run the known frames from the scene's own start, so that the solver stands where the history ends."""
-        self.load(Scene.from_dict(start.scene))
+        self.load(Scene.of(start))
         for _ in range(start.present):
             self.frame()
 
