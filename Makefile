@@ -15,7 +15,7 @@ SNAKEMAKE = $(PY) -m snakemake --workflow-profile profiles/$(PROFILE) --config s
 demo: ## the demonstration: results/demo/report.html, in about twenty minutes on two cores
 	@$(MAKE) --no-print-directory study STUDY=demo
 
-smoke: ## every part once, in about three minutes: results/smoke/report.html
+smoke: ## every part once, in about a minute: results/smoke/report.html
 	@$(MAKE) --no-print-directory study STUDY=smoke
 
 study: setup ## any study, on any machine: make study STUDY=paper PROFILE=slurm (docs/clusters.md)

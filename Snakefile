@@ -1,6 +1,7 @@
 """Sluice: from scene files to a report. ``snakemake --config study=configs/studies/demo.yaml``; options in profiles/default/config.yaml."""
 
 import os
+import re
 import sys
 
 sys.path.insert(0, workflow.basedir)
@@ -12,7 +13,9 @@ from workflow.study import PARTS, load_study
 
 try:
     STUDY = load_study(config.get("study", "configs/studies/smoke.yaml"))
-    if workflow.is_main_process and not {"-n", "--dry-run", "--dryrun"} & set(sys.argv):
+    # Short options may be joined: -nq.
+    dry = any(word in ("--dry-run", "--dryrun") or re.fullmatch("-[A-Za-z]*n[A-Za-z]*", word) for word in sys.argv[1:])
+    if workflow.is_main_process and not dry:
         hold(STUDY.folder)
 except InputError as error:
     # Snakemake turns every exception into a traceback of its own; a mistake in a study is one line and exit code 2.

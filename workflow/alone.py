@@ -23,7 +23,8 @@ def hold(folder: Path) -> None:
         os.write(lock, str(os.getpid()).encode())
     except BlockingIOError:
         process = os.read(lock, 20).decode()
-        remedy = f"another run is at work on it (process {process}); wait for its end, or stop it: kill -INT {process}"
+        stop = f" (process {process}); wait for its end, or stop it: kill -INT {process}" if process else "; wait for its end"  # it may have just begun
+        remedy = f"another run is at work on it{stop}"
         raise InputError(folder, "study", folder.name, remedy) from None
     except OSError as error:
-        raise InputError(folder, "study", folder.name, f"{folder.parent} cannot be written ({error.strerror}); mend that and start again") from None
+        raise InputError(folder, "study", folder.name, f"{folder.parent} cannot be written or locked ({error.strerror}); mend that and start again") from None

@@ -87,11 +87,15 @@ def _provenance(study: Study) -> dict:
 def jobs(study: Study) -> list[dict]:
     """What the steps of the workflow took when they last ran, by Snakemake's benchmarks; the longest first."""
     found: dict[str, list[dict]] = {}
-    known = {*study.data, *study.models, *study.comparisons}
-    files = [path for path in study.folder.glob("benchmarks/*/*.tsv") if any(path.stem == name or path.stem.startswith(f"{name}-") for name in known)]
-    for path in files:
+    # What a study no longer has may have left files.
+    names = {*study.data, *study.comparisons}
+    names |= {f"{model}-{seed}" for model in study.trained for seed in study.models[model]["seeds"]}
+    names |= {f"{comparison}-{model}" for comparison, entry in study.comparisons.items() for model in entry["films"]}
+    files = [(path.parent.name, path) for path in study.folder.glob("benchmarks/*/*.tsv") if path.stem in names]
+    once = study.folder / "benchmarks" / "speed_ups.tsv"
+    for rule, path in [*files, *([("speed_ups", once)] if once.is_file() else [])]:
         with path.open(newline="") as file:
-            found.setdefault(path.parent.name, []).extend(csv.DictReader(file, delimiter="\t"))
+            found.setdefault(rule, []).extend(csv.DictReader(file, delimiter="\t"))
     result = []
     for rule, lines in found.items():
         seconds, memory = [float(line["s"]) for line in lines], [float(line["max_rss"]) for line in lines if line["max_rss"] not in ("-", "NA")]

@@ -50,7 +50,7 @@ def test_a_study_is_held_by_one_process_until_it_ends(tmp_path):
 
 def test_where_nothing_can_be_written(tmp_path):
     (tmp_path / "results").touch()
-    with pytest.raises(InputError, match=r"results cannot be written \(File exists\); mend that"):
+    with pytest.raises(InputError, match=r"results cannot be written or locked \(File exists\); mend that"):
         hold(tmp_path / "results/a")
 
 
@@ -67,7 +67,7 @@ def test_a_second_run_of_a_study_is_refused(tree):
             lines = [line for line in output.splitlines() if line.strip() and not line.startswith("Using ")]
             assert code == 2 and len(lines) == 1, output
             assert lines[0].startswith(f"sluice: results/micro: study = 'micro': another run is at work on it (process {first.pid}); wait")
-        assert first.poll() is None and planned(tree)
+        assert first.poll() is None and planned(tree) and snakemake(tree, "-nq")[0] == 0
     finally:
         os.killpg(first.pid, signal.SIGKILL)
         first.communicate()
