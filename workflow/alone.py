@@ -23,8 +23,9 @@ def hold(folder: Path) -> None:
         os.write(lock, str(os.getpid()).encode())
     except BlockingIOError:
         process = os.read(lock, 20).decode()
-        stop = f" (process {process}); wait for its end, or stop it: kill -INT {process}" if process else "; wait for its end"  # it may have just begun
-        remedy = f"another run is at work on it{stop}"
+        known = f" (process {process}); wait for its end, or stop it: kill -INT {process}"
+        remedy = "another run is at work on it" + (known if process else "; wait for its end")  # it may have just begun
         raise InputError(folder, "study", folder.name, remedy) from None
     except OSError as error:
-        raise InputError(folder, "study", folder.name, f"{folder.parent} cannot be written or locked ({error.strerror}); mend that and start again") from None
+        remedy = f"{folder.parent} cannot be written or locked ({error.strerror}); mend that and start again"
+        raise InputError(folder, "study", folder.name, remedy) from None
