@@ -737,7 +737,7 @@ def test_what_the_solver_cannot_do_is_one_line():
                        "bodies": [{"material": "water", "shape": {"kind": "box", "size": [0.3, 0.3]}}]}  # fmt: skip
     with pytest.raises(InputError, match=r"periodic = y: the box is too narrow there for its particles|periodic = 'y': the box is too narrow"):
         SPHSimulator().plan(SceneFamily(narrow, "tiny.yaml").sample(0))
-    with pytest.raises(InputError, match="particles = 'some': must be teacher or recorded"):
+    with pytest.raises(InputError, match="particles = 'some': must be teacher, recorded or how many times finer"):
         SPHSimulator(particles="some")
 
 
