@@ -26,27 +26,31 @@ def test_trajectories(study: Study, comparison: str) -> list[Trajectory]:
     return [data.trajectory(number) for number in range(min(entry["trajectories"], len(data)))]
 
 
-def learned(study: Study, comparison: str, model: str) -> list[Simulator]:
-    """The model once for every training seed, on one CPU thread like the solvers; refused if it does not fit the test data."""
+def learned(study: Study, comparison: str, model: str, device: str = "cpu") -> list[Simulator]:
+    """The model once for every training seed, on one CPU thread like the solvers or on a GPU; refused if it does not fit the test data."""
     torch.set_num_threads(1)
     entry = study.models[model]
     data = Dataset(study.data_folder(study.comparisons[comparison]["data"], "test"), "test")
     contenders = []
     for seed, path in zip(entry.get("seeds", [None]), study.model_files(model), strict=True):
-        contender = load_model(path)
+        contender = load_model(path, device)
         check_fit(contender, data, path)
         contender.name = model
         contender.settings = {**contender.settings, "model": type(contender).name} | ({} if seed is None else {"seed": seed})
+        if device != "cpu":
+            contender.settings["device"] = device
         contenders.append(contender)
     return contenders
 
 
-def contenders(study: Study, comparison: str, trajectories: list[Trajectory], kinds: tuple[str, ...]) -> list[Simulator]:
-    """Contenders of the given kinds."""
+def contenders(
+    study: Study, comparison: str, trajectories: list[Trajectory], kinds: tuple[str, ...], device: str = "cpu"
+) -> list[Simulator]:  # fmt: skip
+    """Contenders of the given kinds, the learned ones on ``device``."""
     entry = study.comparisons[comparison]
     rungs: list[tuple[str, Kind, dict]] = [(REFERENCE, "reference", {}), *((rung["name"], "solver", rung_settings(rung)) for rung in entry["ladder"])]
     rungs.append((FLOOR, "floor", {"perturbation": PERTURBATION * trajectories[0].radius}))
-    models = [contender for model in entry["learned"] for contender in learned(study, comparison, model)]
+    models = [contender for model in entry["learned"] for contender in learned(study, comparison, model, device)]
     method = trajectories[0].scene.get("solver", {}).get("method", "mpm")
     made = [*solver_ladder(rungs, method), *models, *trivial_baselines(), Oracle(trajectories)]
     return [contender for contender in made if contender.kind in kinds]

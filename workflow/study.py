@@ -103,7 +103,7 @@ class Study:
         return self.content["stability"]
 
     def resource(self, section: str, name: str, key: str, default: int) -> int:
-        """What an entry of ``data`` or ``models`` asks the scheduler for."""
+        """What an entry of ``data``, ``models`` or ``comparisons`` asks the scheduler for."""
         return self.content[section][name].get("resources", {}).get(key, default)
 
     # -- places
@@ -204,7 +204,8 @@ class Study:
 
     def report_recipe(self) -> str:
         """Hash of what the report says beyond its input files: title, targets, settings, and its code and template."""
-        sections = {section: {name: entry | {"resources": None} for name, entry in self.content[section].items()} for section in ("data", "models")}
+        requested = ("data", "models", "comparisons")
+        sections = {section: {name: entry | {"resources": None} for name, entry in self.content[section].items()} for section in requested}
         return digest(self.content | sections, code_hash("workflow.scripts.summary"), _texts("sim/page.*", "learn/*.html"))
 
     def stress_recipe(self, job: str) -> str:

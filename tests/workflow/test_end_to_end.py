@@ -13,6 +13,7 @@ import time
 from pathlib import Path
 
 import pytest
+import torch
 from browser import check, needs_browser
 from study_tree import begin_snakemake, make_tree, planned, promised, snakemake
 
@@ -171,13 +172,13 @@ def test_a_study_chooses_device_and_processes(copied):
     plain = "gns: {config: configs/models/micro_gns.yaml, data: puddle, seeds: [0]}"
     replace(study, plain, plain[:-1] + ", resources: {gpus: 2, threads: 2, mem_mb: 3000, runtime: 5}}")
     replace(study, "train: 2, valid: 1", "resources: {threads: 2}, train: 2, valid: 1")
+    replace(study, "    films: [grid]", "    resources: {gpus: 1}\n    films: [grid]")
     assert planned(copied) == {}  # what runs where is no part of the result
 
-    def command(*options):
-        target = "results/micro/models/gns/seed-0.pt"
-        code, output = snakemake(copied, target, "--dry-run", "--printshellcmds", "--force", *options)
+    def command(*options, target="models/gns/seed-0.pt", program="-m learn train"):
+        code, output = snakemake(copied, f"results/micro/{target}", "--dry-run", "--printshellcmds", "--force", *options)
         assert code == 0, output
-        return re.search(r"Shell command: (.* -m learn train .*)", output)[1]
+        return re.search(rf"Shell command: (.* {program} .*)", output)[1]
 
     one = command()  # of a machine that is not said to have more
     assert "--threads 2 --device cuda" in one and "torch.distributed" not in one
@@ -186,6 +187,15 @@ def test_a_study_chooses_device_and_processes(copied):
     replace(study, "gpus: 2, threads: 2", "gpus: 0")
     none = command()
     assert "--threads 1 --device cpu" in none and "torch.distributed" not in none
+    compared = {"target": "comparisons/puddle/errors.json", "program": "-m workflow.scripts.errors"}
+    assert "errors.json cuda" in command(**compared)
+    if not torch.cuda.is_available():
+        script = [sys.executable, "-m", "workflow.scripts.errors", "configs/studies/micro.yaml", "puddle", "errors.json", "cuda"]
+        refused = subprocess.run(script, cwd=copied, capture_output=True, text=True)
+        assert refused.returncode == 2 and "comparisons.puddle.resources.gpus = 1: this machine has no CUDA device" in refused.stderr
+        assert len(refused.stderr.splitlines()) == 1 and not (copied / "errors.json").exists()
+    replace(study, "gpus: 1", "gpus: 0")
+    assert "errors.json cpu" in command(**compared)
     # The command of two GPUs, on two CPU processes.
     shutil.rmtree(copied / "results" / "micro" / "training" / "gns")
     made = subprocess.run(several.replace("--threads 2 --device cuda", "--device cpu"), shell=True, cwd=copied, executable="/bin/bash")

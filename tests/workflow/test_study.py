@@ -15,6 +15,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from mutations import spoil_yaml  # noqa: E402
 
+from sim.domains import DOMAINS  # noqa: E402
 from sim.errors import InputError  # noqa: E402
 from sim.scene import SceneFamily  # noqa: E402
 from sim.stability import CASES  # noqa: E402
@@ -114,6 +115,8 @@ MISTAKES = [
     (put("models", "gns", "resources", value={"gpus": -1}), "models.gns.resources.gpus = -1"),
     (put("data", "puddle", "resources", value={"gpus": 1}), "data.puddle.resources.gpus = 1: unknown key; the keys"),
     (put("data", "puddle", "resources", value={"threads": 0}), "data.puddle.resources.threads = 0"),
+    (put(*COMPARISON, "resources", value={"gpus": 2}), "comparisons.puddle.resources.gpus = 2: 0 or 1: a comparison runs one rollout at a time"),
+    (put(*COMPARISON, "resources", value={"threads": 2}), "comparisons.puddle.resources.threads = 2: unknown key; the keys here are gpus, mem_mb"),
     (put("models", "gns", "variant", value="big"), "variant = 'big': not among the variants (there are none)"),
     (put("stability", value={"a": ["rest"]}), "a study of stability has title and stability alone"),
     (lambda content: content["comparisons"].update(again=content["comparisons"]["puddle"]), "two comparisons share this one"),
@@ -204,6 +207,10 @@ def test_a_mistake_is_one_line_exit_2_and_nothing_written(tree):
     assert before.keys() == {path for path in tree.rglob("*") if not {"__pycache__", ".snakemake"} & set(path.parts)}
 
 
+#: Trajectories to validate and to test on where they are not a hundred each.
+HELD_OUT = dict.fromkeys(("water", "sand", "goop", "waterdrop", "waterramps", "sandramps"), 30) | {"boxbath": 150}
+
+
 @pytest.mark.workflow
 @pytest.mark.parametrize("name", sorted(path.stem for path in (ROOT / "configs" / "studies").glob("*.yaml") if path.stem != "stability"))
 def test_shipped_studies_resolve(place, name):
@@ -225,16 +232,32 @@ def test_the_stability_study_runs_every_case(place):
     assert jobs == {"stress": len(study), "report": 1} and sorted(sum(study.values(), [])) == sorted(CASES)
 
 
-def test_the_paper_study_is_the_papers_size():
-    study = load_study(ROOT / "configs" / "studies" / "paper.yaml") if Path.cwd() == ROOT else None
-    if study is None:
-        pytest.skip("paths of a study are relative to the root of the repository")
-    (data,) = study.data.values()
-    assert (data["train"], data["valid"], data["test"]) == (1000, 30, 30)
-    assert study.families["waterdrop"].model.frames == 1001
-    config = study.configs["gns"]
-    assert (config["settings"]["latent"], config["settings"]["message_passing"], config["training"]["batch"]) == (128, 10, 2)
-    assert float(config["settings"]["noise"]) == 6.7e-4
+def test_the_paper_study_is_the_papers_size(monkeypatch):
+    """Counts, lengths, radii of all sixteen against ``DOMAINS``, the splits against the released data's."""
+    monkeypatch.chdir(ROOT)
+    study = load_study("configs/studies/paper.yaml")
+    assert set(study.data) == set(study.comparisons) == set(DOMAINS)
+    for name, domain in DOMAINS.items():
+        entry, family = study.data[name], study.families[name].model
+        assert (entry["train"], family.frames - 1, family.radius, family.frame_step) == (domain.trajectories, domain.steps, domain.radius, domain.frame_step)
+        assert entry["valid"] == entry["test"] == HELD_OUT.get(name, 100)
+        assert study.comparisons[name]["learned"] == [f"{name}_gns"]
+        (model,) = study.comparisons[name]["learned"]
+        assert study.models[model]["data"] == name and study.models[model]["resources"]["gpus"] == study.comparisons[name]["resources"]["gpus"] == 1
+        config = study.configs[model]
+        assert (config["settings"]["latent"], config["settings"]["message_passing"], config["training"]["batch"]) == (128, 10, 2)
+        assert float(config["settings"]["noise"]) == 6.7e-4
+    assert study.models["waterdrop_gns"]["seeds"] == [0, 1, 2]
+
+
+def test_the_study_of_sixteen_has_every_domain_as_the_paper_study_has_it(monkeypatch):
+    monkeypatch.chdir(ROOT)
+    small, large = (load_study(f"configs/studies/{name}.yaml") for name in ("sixteen", "paper"))
+    for name in DOMAINS:
+        ours, theirs = small.families[name].to_dict(), large.families[name].to_dict()
+        assert ours | {"frames": 0} == theirs | {"frames": 0} and ours["frames"] in (theirs["frames"], 201)
+        assert small.comparisons[name]["ladder"] == large.comparisons[name]["ladder"]
+    assert list(small.comparisons) == list(large.comparisons)
 
 
 @pytest.mark.parametrize(("over", "known"), [("particles", [(352, 616)]), ("sand.friction_angle", [(15, 30), (55, 70)])])

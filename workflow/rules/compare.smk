@@ -12,6 +12,11 @@ def learned_models(wildcards):
     return [path for model in STUDY.comparisons[wildcards.comparison]["learned"] for path in STUDY.model_files(model)]
 
 
+def asked(key, default):
+    """A resource of a comparison's errors, for the scheduler."""
+    return lambda wildcards: STUDY.resource("comparisons", wildcards.comparison, key, default)
+
+
 rule errors:
     input:
         data=truth,
@@ -20,18 +25,21 @@ rule errors:
         f"{RESULTS}/comparisons/{{comparison}}/errors.json",
     params:
         recipe=lambda wildcards: STUDY.comparison_recipe(wildcards.comparison, ERROR_KEYS, "errors"),
+        # Of what is granted: no part of the result, so that a GPU where there was none compares nothing again.
+        device=lambda wildcards, resources: "cuda" if resources.gpu else "cpu",
     log:
         f"{RESULTS}/logs/errors/{{comparison}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/errors/{{comparison}}.tsv"
     threads: 1
     resources:
-        mem_mb=4000,
-        runtime=120,
+        mem_mb=asked("mem_mb", 4000),
+        runtime=asked("runtime", 120),
+        gpu=asked("gpus", 0),
     message:
         "Errors of the contenders on {wildcards.comparison}"
     shell:
-        "{PYTHON} -m workflow.scripts.errors {STUDY.path} {wildcards.comparison} {output} > {log} 2>&1"
+        "{PYTHON} -m workflow.scripts.errors {STUDY.path} {wildcards.comparison} {output} {params.device} > {log} 2>&1"
 
 
 rule timing:
