@@ -26,6 +26,7 @@ resume: study ## after a kill or a power cut: make resume STUDY=demo continues w
 
 test: setup
 	@$(PY) -m ruff check .
+	@$(PY) -m ruff format --check .
 	@$(PY) -m mypy
 	@$(PY) -m pytest -n 2 --dist loadfile
 

@@ -56,6 +56,7 @@ def dam() -> Scene:
 
 def density(position: np.ndarray) -> np.ndarray:
     """[particles], 1 in a lattice."""
+
     def kernel(r: np.ndarray) -> np.ndarray:
         return (1 - r / SUPPORT) ** 4 * (1 + 4 * r / SUPPORT)
 
@@ -72,9 +73,11 @@ def curves(position: np.ndarray) -> dict[str, np.ndarray]:
     now = position[1:]
     dense = np.array([density(frame) for frame in now])
     return {
-        "front": now[:, :, 0].max(1), "height": now[:, :, 1].mean(1),
+        "front": now[:, :, 0].max(1),
+        "height": now[:, :, 1].mean(1),
         "wall": np.array([np.percentile(frame[frame[:, 0] < 0.2, 1], 95) for frame in now]),
-        "median": np.median(dense, 1), "crowded": np.percentile(dense, 99, axis=1),
+        "median": np.median(dense, 1),
+        "crowded": np.percentile(dense, 99, axis=1),
         "energy": (velocity**2).sum(2).mean(1) / 2 + G * (now[:, :, 1] + position[:-1, :, 1]).mean(1) / 2,
     }
 
@@ -101,8 +104,12 @@ def draw(path: Path, found: dict[str, dict], time_axis: np.ndarray) -> None:
     figure = plt.figure(figsize=(13, 8.6), layout="constrained")
     above, below = figure.subfigures(2, 1, height_ratios=(1, 1.35))
     axes = above.subplots(1, 4)
-    panels = (("front [m]", ("front",)), ("height: mean, by the left wall (95 %) [m]", ("height", "wall")),
-              ("density: median, 99th percentile", ("median", "crowded")), ("energy [J/kg]", ("energy",)))
+    panels = (
+        ("front [m]", ("front",)),
+        ("height: mean, by the left wall (95 %) [m]", ("height", "wall")),
+        ("density: median, 99th percentile", ("median", "crowded")),
+        ("energy [J/kg]", ("energy",)),
+    )
     for axis, (title, names) in zip(axes, panels, strict=True):
         for label, entry in found.items():
             for name, dash in zip(names, ("-", "--"), strict=False):

@@ -56,13 +56,28 @@ def scene(particles: int, dim: int = 2) -> tuple[DataSpec, Windows, Start]:
     upper = float(np.ceil(position.max() + 0.1))
     gravity = (0,) * (dim - 1) + (-9.81,)
     spec = DataSpec(
-        dim=dim, bounds=((0, upper),) * dim, radius=RADIUS, spacing=spacing, frame_step=0.0025, stride=1, gravity=gravity, particle_types=(5,),
-        velocity_mean=(0,) * dim, velocity_std=(1.4e-3,) * dim, acceleration_mean=(0,) * dim, acceleration_std=(1e-4,) * dim,
+        dim=dim,
+        bounds=((0, upper),) * dim,
+        radius=RADIUS,
+        spacing=spacing,
+        frame_step=0.0025,
+        stride=1,
+        gravity=gravity,
+        particle_types=(5,),
+        velocity_mean=(0,) * dim,
+        velocity_std=(1.4e-3,) * dim,
+        acceleration_mean=(0,) * dim,
+        acceleration_std=(1e-4,) * dim,
     )
     windows = Windows(torch.from_numpy(position), torch.full((particles,), 5), torch.zeros(particles, dtype=torch.int64))
     start = Start(
-        history=position[:6], particle_type=np.full(particles, 5, np.int8), present=5, frame_step=spec.frame_step, radius=RADIUS,
-        bounds=np.array(spec.bounds), scene={"gravity": spec.gravity},
+        history=position[:6],
+        particle_type=np.full(particles, 5, np.int8),
+        present=5,
+        frame_step=spec.frame_step,
+        radius=RADIUS,
+        bounds=np.array(spec.bounds),
+        scene={"gravity": spec.gravity},
     )
     return spec, windows, start
 
@@ -162,8 +177,11 @@ def main() -> None:
     units = bf16_units()
     precisions = arguments.precisions or (["f32", "bf16"] if units else ["f32"])
     results = {
-        "machine": platform.processor() or platform.machine(), "capability": torch.backends.cpu.get_cpu_capability(), "torch": torch.__version__,
-        "bf16_units": units, "sizes": {},
+        "machine": platform.processor() or platform.machine(),
+        "capability": torch.backends.cpu.get_cpu_capability(),
+        "torch": torch.__version__,
+        "bf16_units": units,
+        "sizes": {},
     }
     print(f"capability {results['capability']}, bf16 units: {', '.join(units) or 'none, so bf16 is emulated and left out unless asked for'}")
     for size in arguments.sizes:

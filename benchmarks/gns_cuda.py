@@ -135,6 +135,7 @@ def measure(particles: int, dim: int, batch: int, latent: int, blocks: int, seco
         def run():
             with torch.autocast("cuda", torch.bfloat16):
                 return step()
+
         return run
 
     parameters = list(model.parameters())
@@ -146,12 +147,15 @@ def measure(particles: int, dim: int, batch: int, latent: int, blocks: int, seco
     found["search_on_host_ms"] = 1e3 * (time.perf_counter() - begun) / 5
     found["training_step_ms"] = {
         "ours": throughput(lambda: ours.step(windows, generator, 1e-6, 0.999), seconds),
-        "textbook f32": throughput(train, seconds), "textbook bf16": throughput(half(train), seconds),
+        "textbook f32": throughput(train, seconds),
+        "textbook bf16": throughput(half(train), seconds),
     }
     settled = ours.settle()
     assert settled[2:] == (0, 0), settled
     found["rollout_step_ms"] = {
-        "ours": timed(roll(model), seconds), "textbook f32": timed(roll(plain), seconds), "textbook bf16": timed(half(roll(plain)), seconds),
+        "ours": timed(roll(model), seconds),
+        "textbook f32": timed(roll(plain), seconds),
+        "textbook bf16": timed(half(roll(plain)), seconds),
     }
     work = operations(particles, found["edges"] // batch, latent, blocks)
     found["roofline_share"] = {

@@ -77,8 +77,12 @@ class CLoop:
         self.dx = scene.grid_spacing / scene.refine
         n, volume = len(particles.position), particles.spacing**dim
         self.setting = _setting(dim)(
-            (ctypes.c_int * dim)(*(cells * scene.refine for cells in scene.cells)), self.dx, (ctypes.c_float * dim)(*scene.gravity),
-            scene.walls.friction, material.density * volume, volume,
+            (ctypes.c_int * dim)(*(cells * scene.refine for cells in scene.cells)),
+            self.dx,
+            (ctypes.c_float * dim)(*scene.gravity),
+            scene.walls.friction,
+            material.density * volume,
+            volume,
         )
         self.x = np.ascontiguousarray((particles.position - self.lower) / self.dx + 1, np.float32)
         self.v = np.ascontiguousarray(particles.velocity, np.float32)

@@ -363,6 +363,7 @@ class CConv(nn.Module):
 
     def _around(self, position: Tensor, moving: Tensor, example: Tensor | None, walls: Walls) -> tuple[Pairs, Tensor, Pairs]:
         """Pairs of moving particles, features of the boundary (kinematic particles, then walls), and its pairs with moving particles."""
+
         def pairs(offset: Tensor, outer: Tensor, inner: Tensor, size: tuple[int, int]) -> Pairs:
             return Pairs.between((walls.shortest(offset) / self.radius).to(self.gravity.dtype), outer, inner, size, self.options.kernel)
 
@@ -490,10 +491,19 @@ def load_published(path: str | Path, spacing: float = 0.05, frame_step: float = 
     gravity = tuple(weights["gravity"].double().flatten().tolist()) if "gravity" in weights else ()
     try:
         spec = DataSpec(
-            dim=3, bounds=((0.0, 1.0),) * 3, radius=2.25 * spacing, spacing=spacing, frame_step=frame_step, stride=1, gravity=gravity,
-            particle_types=(PARTICLE_TYPES["water"],), velocity_mean=(0.0,) * 3, acceleration_mean=(0.0,) * 3,
+            dim=3,
+            bounds=((0.0, 1.0),) * 3,
+            radius=2.25 * spacing,
+            spacing=spacing,
+            frame_step=frame_step,
+            stride=1,
+            gravity=gravity,
+            particle_types=(PARTICLE_TYPES["water"],),
+            velocity_mean=(0.0,) * 3,
+            acceleration_mean=(0.0,) * 3,
             # Scales of its input and output: 1 m / s and 1 / 128 m.
-            velocity_std=(frame_step,) * 3, acceleration_std=(1 / 128,) * 3,
+            velocity_std=(frame_step,) * 3,
+            acceleration_std=(1 / 128,) * 3,
         )
         model = CConv(CConvSettings(channels=tuple(channels), kernel=kernel[0]), spec)
     except ValueError as error:

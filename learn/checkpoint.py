@@ -114,11 +114,18 @@ def save_model(path: str | Path, model: nn.Module, provenance: dict | None = Non
     names = [name for name, place in MODELS.items() if place == (type(model).__module__, type(model).__qualname__)]
     if not names:
         raise ValueError(f"{type(model).__name__} is not registered in learn/model.py")
-    write_content(path, {
-        "format": MODEL_FORMAT, "format_version": FORMAT_VERSION, "model": names[0], "settings": json.loads(json.dumps(model.settings)),
-        "spec": model.spec.to_dict(), "provenance": json.loads(json.dumps(provenance or {})),
-        "state_dict": {name: value.detach().cpu().contiguous() for name, value in model.state_dict().items()},
-    })
+    write_content(
+        path,
+        {
+            "format": MODEL_FORMAT,
+            "format_version": FORMAT_VERSION,
+            "model": names[0],
+            "settings": json.loads(json.dumps(model.settings)),
+            "spec": model.spec.to_dict(),
+            "provenance": json.loads(json.dumps(provenance or {})),
+            "state_dict": {name: value.detach().cpu().contiguous() for name, value in model.state_dict().items()},
+        },
+    )
 
 
 def read_model_file(path: str | Path, device: torch.device | str = "cpu") -> dict:
@@ -190,8 +197,16 @@ def file_hash(path: str | Path) -> str:
 
 #: What a training state holds besides its format, see ``learn/train.py``.
 STATE_KEYS = {
-    "config": dict, "spec": dict, "model": dict, "average": dict, "optimizer": dict, "sampler": dict, "generator": torch.Tensor,
-    "torch_random": torch.Tensor, "device_random": list, "progress": dict,
+    "config": dict,
+    "spec": dict,
+    "model": dict,
+    "average": dict,
+    "optimizer": dict,
+    "sampler": dict,
+    "generator": torch.Tensor,
+    "torch_random": torch.Tensor,
+    "device_random": list,
+    "progress": dict,
 }
 
 

@@ -92,8 +92,13 @@ def _import_model(arguments: argparse.Namespace) -> None:
     if Path(arguments.out).exists():
         raise InputError(arguments.out, "--out", arguments.out, "exists; give another name, or delete it")
     model = import_model(
-        arguments.model, arguments.metadata, edges=arguments.edges, noise_std=arguments.noise_std, spacing=arguments.spacing,
-        gravity=arguments.gravity, particle_types=arguments.types,
+        arguments.model,
+        arguments.metadata,
+        edges=arguments.edges,
+        noise_std=arguments.noise_std,
+        spacing=arguments.spacing,
+        gravity=arguments.gravity,
+        particle_types=arguments.types,
     )
     save_model(arguments.out, model, {"source": "geoelements/gns", "file": arguments.model, "sha256": file_hash(arguments.model)})
     print(f"{arguments.out}: {model.options.message_passing} blocks of width {model.options.latent}, {model.velocities} velocities")
@@ -182,8 +187,11 @@ def parser() -> argparse.ArgumentParser:
     taken = commands.add_parser("import-model", help="make a checkpoint of a model of geoelements/gns", description=text)
     taken.add_argument("model", metavar="MODEL", help="a model-<step>.pt")
     taken.add_argument("--metadata", required=True, metavar="FILE", help="the metadata.json of its data")
-    taken.add_argument("--edges", choices=("updated", "doubled"),
-                       help="what its version did to them after a block: updated since 11 December 2024, doubled before (v1.1.1, say)")
+    taken.add_argument(
+        "--edges",
+        choices=("updated", "doubled"),
+        help="what its version did to them after a block: updated since 11 December 2024, doubled before (v1.1.1, say)",
+    )
     taken.add_argument("--noise-std", type=float, metavar="S", help="as given to its train.py, default: 6.7e-4")
     taken.add_argument("--spacing", type=float, metavar="H", help="of the particles")
     taken.add_argument("--gravity", type=float, nargs="+", metavar="G", help="one number an axis, length / s^2")

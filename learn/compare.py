@@ -84,12 +84,19 @@ def _measure(contender: Simulator, trajectory: Trajectory, settings: CompareSett
     run = _drive(contender, start_from(trajectory, history), frames)
     done = int(np.isfinite(run.position).all(axis=(1, 2)).sum())
     figures = _single_steps(contender, trajectory, settings, history) | metrics.evaluate(
-        run.position, trajectory, present, horizons=settings.horizons,
-        emd_particles=settings.emd_particles, sinkhorn_particles=settings.sinkhorn_particles,
+        run.position,
+        trajectory,
+        present,
+        horizons=settings.horizons,
+        emd_particles=settings.emd_particles,
+        sinkhorn_particles=settings.sinkhorn_particles,
     )
     figures |= {
-        "trajectory_seed": trajectory.seed, "model_seed": contender.settings.get("seed"), "status": run.status,
-        "particles": trajectory.position.shape[1], "context": _context_numbers(trajectory),
+        "trajectory_seed": trajectory.seed,
+        "model_seed": contender.settings.get("seed"),
+        "status": run.status,
+        "particles": trajectory.position.shape[1],
+        "context": _context_numbers(trajectory),
         "seconds_per_frame": run.seconds / done if done else math.nan,
     }
     before, true, period = trajectory.position[present, moving], trajectory.position[history:, moving], trajectory.period
@@ -99,7 +106,8 @@ def _measure(contender: Simulator, trajectory: Trajectory, settings: CompareSett
 
     curves = {
         "mse": metrics.frame_mse(periodic.beside(run.position[:, moving], true, period), true),
-        "kinetic_energy": energy(run.position[:, moving]), "kinetic_energy_true": energy(true),
+        "kinetic_energy": energy(run.position[:, moving]),
+        "kinetic_energy_true": energy(true),
     }
     return figures, curves
 
@@ -142,8 +150,15 @@ def _figures(runs: list[dict]) -> list[dict]:
     return [{key: value for key, value in run.items() if key not in _LABELS} for run in runs]
 
 
-def _row(scene: str, contenders: list[Simulator], runs: list[dict], curves: list[dict], trajectories: list[Trajectory], settings: CompareSettings,
-         history: int) -> dict:
+def _row(
+    scene: str,
+    contenders: list[Simulator],
+    runs: list[dict],
+    curves: list[dict],
+    trajectories: list[Trajectory],
+    settings: CompareSettings,
+    history: int,
+) -> dict:
     contender, frame_step = contenders[0], trajectories[0].frame_step
     failed = [run["status"] for run in runs if run["status"] != "ok"]
     status = "ok" if not failed else f"failed in {len(failed)} of {len(runs)}: {failed[0].removeprefix('failed: ')}"
@@ -154,13 +169,20 @@ def _row(scene: str, contenders: list[Simulator], runs: list[dict], curves: list
     length = min(len(curve["mse"]) for curve in curves)
     kept = np.unique(np.linspace(0, length - 1, settings.curve_points).round().astype(int))
     stacked = {name: np.nan_to_num(np.stack([curve[name][kept] for curve in curves]), nan=math.inf, posinf=math.inf) for name in curves[0]}
-    bands = {
-        name: {"median": np.median(values, axis=0), "min": values.min(axis=0), "max": values.max(axis=0)} for name, values in stacked.items()
-    }
+    bands = {name: {"median": np.median(values, axis=0), "min": values.min(axis=0), "max": values.max(axis=0)} for name, values in stacked.items()}
     row = {
-        "scene": scene, "contender": contender.name, "kind": contender.kind, "settings": shown, "reference": settings.reference,
-        "status": status, "failures": len(failed), "runs": len(runs), "trajectories": len(trajectories),
-        "known_frames": history, "frames": length, "frame_step": frame_step,
+        "scene": scene,
+        "contender": contender.name,
+        "kind": contender.kind,
+        "settings": shown,
+        "reference": settings.reference,
+        "status": status,
+        "failures": len(failed),
+        "runs": len(runs),
+        "trajectories": len(trajectories),
+        "known_frames": history,
+        "frames": length,
+        "frame_step": frame_step,
         "one_step_note": "restarts from a scene only, not from positions" if contender.kind in _FROM_SCENE else None,
         **median,
         "seconds_per_simulated_second": median["seconds_per_frame"] / frame_step,
@@ -168,7 +190,8 @@ def _row(scene: str, contenders: list[Simulator], runs: list[dict], curves: list
         "timing": "rollouts of the comparison, one after the other",
         "mean": _aggregate(figures, np.mean),
         "spread": {
-            "min": _aggregate(figures, np.min), "max": _aggregate(figures, np.max),
+            "min": _aggregate(figures, np.min),
+            "max": _aggregate(figures, np.max),
             "per_seed": [{"seed": seed} | _aggregate(_figures([run for run in runs if run["model_seed"] == seed]), np.median) for seed in seeds],
             "per_trajectory": runs,
         },
@@ -281,7 +304,11 @@ def time_interleaved(contenders: Sequence[Simulator], start: Start, frames: int,
                 per_frame[index].append(seconds)
     return [
         Timing(
-            contender=contender.name, frame_step=start.frame_step, frames=frames, per_frame=per_frame[index], status=status[index],
+            contender=contender.name,
+            frame_step=start.frame_step,
+            frames=frames,
+            per_frame=per_frame[index],
+            status=status[index],
             compile_seconds=max(first[index] - float(np.median(later[index])), 0.0) if later[index] else math.nan,
         )
         for index, contender in enumerate(contenders)
@@ -289,7 +316,7 @@ def time_interleaved(contenders: Sequence[Simulator], start: Start, frames: int,
 
 
 def time_comparison(
-    contenders: Sequence[Simulator], trajectory: Trajectory, settings: CompareSettings, frames: int, repeats: int = 5,
+    contenders: Sequence[Simulator], trajectory: Trajectory, settings: CompareSettings, frames: int, repeats: int = 5
 ) -> list[Timing]:
     """``time_interleaved`` from the start that ``compare`` gives, one contender a name: repeated trainings cost the same."""
     one_each = {contender.name: contender for contender in reversed(contenders)}
@@ -306,8 +333,10 @@ def attach_timing(rows: list[dict], timings: Iterable[Timing], scene: str) -> li
         if row["scene"] == scene and timing is not None and timing.per_frame:
             low, high, median = min(timing.per_frame), max(timing.per_frame), float(np.median(timing.per_frame))
             row = row | {
-                "seconds_per_frame": median, "seconds_per_simulated_second": median / timing.frame_step,
-                "compile_seconds": timing.compile_seconds, "timing_spread": {"seconds_per_frame": [low, high], "n": len(timing.per_frame)},
+                "seconds_per_frame": median,
+                "seconds_per_simulated_second": median / timing.frame_step,
+                "compile_seconds": timing.compile_seconds,
+                "timing_spread": {"seconds_per_frame": [low, high], "n": len(timing.per_frame)},
                 "timing": f"interleaved, median of {len(timing.per_frame)} warm runs of {timing.frames} frames",
             }
         result.append(row)
@@ -333,9 +362,7 @@ def hardware() -> dict:
         "usable_cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
         "flags": [flag for flag in _FLAGS if flag in flags],
         "memory_gib": round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1),
-        "threads": {
-            "OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS"), "torch": torch.get_num_threads() if torch else None,
-        },
+        "threads": {"OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS"), "torch": torch.get_num_threads() if torch else None},
         "gpu": torch.cuda.get_device_name() if torch and torch.cuda.is_available() else None,
     }
 
@@ -402,7 +429,8 @@ def _comparable(rows: Sequence[dict], row: dict, kinds: Sequence[str]) -> list[d
 def _rungs(rows: list[dict], model: dict, yardstick: Yardstick) -> list[dict]:
     """The solver rungs a model can be measured with: same scene and reference, no failure, error and time known."""
     return [
-        row for row in _comparable(rows, model, SOLVERS)
+        row
+        for row in _comparable(rows, model, SOLVERS)
         if row["failures"] == 0 and yardstick.of(row) is not None and row["seconds_per_frame"] is not None
     ]
 
@@ -477,7 +505,8 @@ def break_even(cost_seconds: float, solver_seconds: float, model_seconds: float)
 def pareto_front(rows: Sequence[dict], yardstick: Yardstick = MOVING_MSE) -> list[dict]:
     """Solver rungs and learned models that no other one beats in both time and error, by time; failed ones are never on it. One scene."""
     usable = [
-        row for row in rows
+        row
+        for row in rows
         if row["kind"] in (*SOLVERS, "learned") and row["failures"] == 0 and yardstick.of(row) is not None and row["seconds_per_frame"] is not None
     ]
     front: list[dict] = []
@@ -528,14 +557,24 @@ def analyse(rows: list[dict], yardstick: Yardstick = MOVING_MSE) -> list[dict]:
             return break_even(model["cost"]["generation_seconds"] + model["cost"]["training_seconds"], ratio * seconds, seconds)
 
         front = pareto_front(_comparable(rows, model, (*SOLVERS, "learned")), yardstick)
-        result.append({
-            "scene": model["scene"], "contender": model["contender"], "reference": model["reference"], "yardstick": str(yardstick),
-            "error": yardstick.of(model), "seconds_per_frame": model["seconds_per_frame"],
-            "speed_up_paper": paper, "equal_error": equal, "equal_time": error_at_equal_time(rows, model, yardstick),
-            "break_even": even(equal["ratio"]), "break_even_reference": even(paper),
-            "worse_than_trivial": worse_than_trivial(rows, model, yardstick), "over_floor": over_floor(rows, model),
-            "pareto": any(row is model for row in front),
-        })
+        result.append(
+            {
+                "scene": model["scene"],
+                "contender": model["contender"],
+                "reference": model["reference"],
+                "yardstick": str(yardstick),
+                "error": yardstick.of(model),
+                "seconds_per_frame": model["seconds_per_frame"],
+                "speed_up_paper": paper,
+                "equal_error": equal,
+                "equal_time": error_at_equal_time(rows, model, yardstick),
+                "break_even": even(equal["ratio"]),
+                "break_even_reference": even(paper),
+                "worse_than_trivial": worse_than_trivial(rows, model, yardstick),
+                "over_floor": over_floor(rows, model),
+                "pareto": any(row is model for row in front),
+            }
+        )
     return result
 
 
@@ -688,8 +727,10 @@ def _headline(groups: dict[tuple[str, str], list[dict]], yardstick: Yardstick) -
         lost = f"{len(where['loses'])} the solver is faster" if wins else f"{len(where['loses'])} the best loses to the solver"
         sentences.append(f"On {lost}, by the least on {place}, where {model} takes {number(1 / ratio)} times as long.")
     for outcome, text in (
-        ("ties", "the best ties with the solver within the spread of the timings"), ("no rung", "no solver rung that was timed is as accurate"),
-        ("worse than trivial", "the best is worse than a trivial baseline"), ("failed", "none finished every rollout"),
+        ("ties", "the best ties with the solver within the spread of the timings"),
+        ("no rung", "no solver rung that was timed is as accurate"),
+        ("worse than trivial", "the best is worse than a trivial baseline"),
+        ("failed", "none finished every rollout"),
         ("none", "no learned model was compared"),
     ):
         if outcome in where:

@@ -91,8 +91,11 @@ class DataSpec:
                 raise ValueError(f"{name} = {getattr(self, name)!r}: {remedy}")
 
         check(integer(self.dim) and self.dim in (2, 3), "dim", "must be 2 or 3")
-        check(isinstance(self.bounds, tuple) and len(self.bounds) == self.dim and all(numbers(b, 2) and b[0] < b[1] for b in self.bounds),
-              "bounds", "must be dim pairs, lower < upper")
+        check(
+            isinstance(self.bounds, tuple) and len(self.bounds) == self.dim and all(numbers(b, 2) and b[0] < b[1] for b in self.bounds),
+            "bounds",
+            "must be dim pairs, lower < upper",
+        )
         for name in ("radius", "spacing", "frame_step"):
             check(number(getattr(self, name)) and getattr(self, name) > 0, name, "must be a positive number")
         check(integer(self.stride) and self.stride >= 1, "stride", "must be an integer >= 1")
@@ -250,8 +253,13 @@ class Dataset:
             try:
                 scene = meta["scene"]
                 values: dict[str, Any] = {
-                    "dim": dim, "radius": float(meta["radius"]), "frame_step": float(meta["frame_step"]), "bounds": _tuple(meta["bounds"]),
-                    "spacing": float(scene["spacing"]), "gravity": tuple(float(g) for g in scene["gravity"]), "periodic": periodic.axes(scene),
+                    "dim": dim,
+                    "radius": float(meta["radius"]),
+                    "frame_step": float(meta["frame_step"]),
+                    "bounds": _tuple(meta["bounds"]),
+                    "spacing": float(scene["spacing"]),
+                    "gravity": tuple(float(g) for g in scene["gravity"]),
+                    "periodic": periodic.axes(scene),
                 }
                 if len(values["gravity"]) != dim:
                     raise ValueError(f"gravity has {len(values['gravity'])} entries")
@@ -337,8 +345,10 @@ class Dataset:
             remedy = f"no trajectory of the {self.split} split has {2 * stride + 1} frames and a moving particle"
             raise InputError(self.path, "data.stride", stride, remedy)
         return {
-            "velocity_mean": velocity.mean, "velocity_std": velocity.std,
-            "acceleration_mean": acceleration.mean, "acceleration_std": acceleration.std,
+            "velocity_mean": velocity.mean,
+            "velocity_std": velocity.std,
+            "acceleration_mean": acceleration.mean,
+            "acceleration_std": acceleration.std,
         }
 
     def _given(self, name: str) -> list[float]:
@@ -444,8 +454,10 @@ class Dataset:
                 contexts.append(context[frame])
         example = np.repeat(np.arange(len(blocks)), [len(kind) for kind in kinds])
         return Windows(
-            position=torch.from_numpy(np.concatenate(blocks, axis=1)), particle_type=torch.from_numpy(np.concatenate(kinds)),
-            example=torch.from_numpy(example), context=torch.from_numpy(np.stack(contexts, axis=1)) if contexts else None,
+            position=torch.from_numpy(np.concatenate(blocks, axis=1)),
+            particle_type=torch.from_numpy(np.concatenate(kinds)),
+            example=torch.from_numpy(example),
+            context=torch.from_numpy(np.stack(contexts, axis=1)) if contexts else None,
         )
 
 
@@ -459,8 +471,9 @@ class Sampler:
     each of ``processes``, of which it then holds this one's share. Raises ``InputError`` for data that cannot be drawn from so.
     """
 
-    def __init__(self, dataset: Dataset, settings: DataSettings, batch: int | None, seed: int, edges: int | None = None,
-                 processes: Processes | None = None):
+    def __init__(
+        self, dataset: Dataset, settings: DataSettings, batch: int | None, seed: int, edges: int | None = None, processes: Processes | None = None
+    ):
         self.dataset, self.settings, self.size, self.seed = dataset, settings, batch, seed
         self.processes, self.edges = processes, edges
         self.least = processes.size if processes else 1

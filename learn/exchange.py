@@ -50,7 +50,12 @@ _FIRST = f"{_ROOT}_encoder.node_fn.0.NN-0."  # the first layer of the node encod
 
 #: What the port does not have, by the settings that leave it out.
 _PUBLISHED = {
-    "inputs": "velocity", "encoder": "relative", "relative_velocity": False, "self_edges": True, "walls": False, "flight_below": 0,
+    "inputs": "velocity",
+    "encoder": "relative",
+    "relative_velocity": False,
+    "self_edges": True,
+    "walls": False,
+    "flight_below": 0,
     "relaxation": None,
 }
 
@@ -100,8 +105,14 @@ def read_metadata(path: str | Path, **given: object) -> Metadata:
 
 
 def import_model(
-    path: str | Path, metadata: str | Path, *, edges: Literal["updated", "doubled"] | None = None, noise_std: float | None = None,
-    spacing: float | None = None, gravity: Sequence[float] | None = None, particle_types: Sequence[int] | None = None,
+    path: str | Path,
+    metadata: str | Path,
+    *,
+    edges: Literal["updated", "doubled"] | None = None,
+    noise_std: float | None = None,
+    spacing: float | None = None,
+    gravity: Sequence[float] | None = None,
+    particle_types: Sequence[int] | None = None,
 ) -> GNS:
     """The GNS of a ``model-<step>.pt`` of the port and the ``metadata.json`` of its data.
 
@@ -118,10 +129,20 @@ def import_model(
         settings["wall_distance"] = known.boundary_augment * known.default_connectivity_radius / known.spacing
     try:
         spec = DataSpec(
-            dim=known.dim, bounds=known.bounds, radius=known.default_connectivity_radius, spacing=known.spacing, frame_step=known.dt,
-            stride=1, gravity=known.gravity, particle_types=tuple(sorted(set(known.particle_types))), velocity_mean=known.vel_mean,
-            velocity_std=known.vel_std, acceleration_mean=known.acc_mean, acceleration_std=known.acc_std,
-            context_mean=(0.0,) if context else None, context_std=(1.0,) if context else None,
+            dim=known.dim,
+            bounds=known.bounds,
+            radius=known.default_connectivity_radius,
+            spacing=known.spacing,
+            frame_step=known.dt,
+            stride=1,
+            gravity=known.gravity,
+            particle_types=tuple(sorted(set(known.particle_types))),
+            velocity_mean=known.vel_mean,
+            velocity_std=known.vel_std,
+            acceleration_mean=known.acc_mean,
+            acceleration_std=known.acc_std,
+            context_mean=(0.0,) if context else None,
+            context_std=(1.0,) if context else None,
         )
     except ValueError as error:
         raise InputError(metadata, "metadata", str(error), "correct it, or the option that says so") from None
@@ -157,14 +178,28 @@ def export_model(model: GNS, out: str | Path) -> dict:
         raise InputError("model", "context", len(spec.context_mean or ()), "geoelements/gns knows one number only, a material property")
     weights = port_weights(model)
     metadata = {
-        "dim": spec.dim, "bounds": spec.bounds, "default_connectivity_radius": model.radius, "dt": spec.frame_step, "sequence_length": None,
-        "vel_mean": spec.velocity_mean, "acc_mean": spec.acceleration_mean,
+        "dim": spec.dim,
+        "bounds": spec.bounds,
+        "default_connectivity_radius": model.radius,
+        "dt": spec.frame_step,
+        "sequence_length": None,
+        "vel_mean": spec.velocity_mean,
+        "acc_mean": spec.acceleration_mean,
         # It divides by the standard deviation of an axis without motion.
-        "vel_std": [max(s, SMALLEST_STD) for s in spec.velocity_std], "acc_std": [max(s, SMALLEST_STD) for s in spec.acceleration_std],
-        "boundary_augment": model.features.wall_distance / model.radius, "nnode_in": weights[f"{_FIRST}weight"].shape[1], "nedge_in": spec.dim + 1,
-        "latent_dim": options.latent, "mlp_hidden_dim": options.latent, "nmlp_layers": options.hidden_layers,
-        "nmessage_passing_steps": options.message_passing, "input_sequence_length": model.velocities + 1,
-        "noise_std": model.sigma, "edges": "updated" if options.edge_update else "doubled", "spacing": spec.spacing, "gravity": spec.gravity,
+        "vel_std": [max(s, SMALLEST_STD) for s in spec.velocity_std],
+        "acc_std": [max(s, SMALLEST_STD) for s in spec.acceleration_std],
+        "boundary_augment": model.features.wall_distance / model.radius,
+        "nnode_in": weights[f"{_FIRST}weight"].shape[1],
+        "nedge_in": spec.dim + 1,
+        "latent_dim": options.latent,
+        "mlp_hidden_dim": options.latent,
+        "nmlp_layers": options.hidden_layers,
+        "nmessage_passing_steps": options.message_passing,
+        "input_sequence_length": model.velocities + 1,
+        "noise_std": model.sigma,
+        "edges": "updated" if options.edge_update else "doubled",
+        "spacing": spec.spacing,
+        "gravity": spec.gravity,
         "particle_types": spec.particle_types,
     }
     try:
@@ -208,7 +243,7 @@ def _own_weights(model: GNS, weights: dict[str, Tensor]) -> dict[str, Tensor]:
     motion, walls, _, context = _columns(model)
     motion, walls, types, context = port[f"{_FIRST}weight"].split((motion, walls, TYPE_WIDTH, context), 1)
     if features.embedding is None:
-        only, = model.spec.particle_types
+        (only,) = model.spec.particle_types
         port[f"{_FIRST}bias"] = port[f"{_FIRST}bias"] + types @ port[_EMBEDDING][only]
         types = types[:, :0]
     port[f"{_FIRST}weight"] = torch.cat([motion, walls * (features.wall_distance / model.radius), types, context], 1)

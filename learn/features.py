@@ -39,7 +39,11 @@ def random_walk_noise(
 
 
 def velocity_noise(
-    scheme: NoiseScheme, position: Tensor, sigma: float | Tensor, generator: torch.Generator, moving: Tensor | None = None,
+    scheme: NoiseScheme,
+    position: Tensor,
+    sigma: float | Tensor,
+    generator: torch.Generator,
+    moving: Tensor | None = None,
     place: tuple[int, int] | None = None,
 ) -> Tensor:
     """Noise for a window of positions, summed up from noise of its C = frames - 1 velocities; [frames, particles, dim], zero in the first frame.
@@ -83,8 +87,20 @@ class Features(nn.Module):
     for absolute places in a periodic box.
     """
 
-    def __init__(self, spec: DataSpec, *, sigma: float, velocities: int, radius: float, wall_distance: float, scaling: InputScaling,
-                 relative_velocity: bool, ballistic: bool, walls: bool = False, absolute: bool = False):
+    def __init__(
+        self,
+        spec: DataSpec,
+        *,
+        sigma: float,
+        velocities: int,
+        radius: float,
+        wall_distance: float,
+        scaling: InputScaling,
+        relative_velocity: bool,
+        ballistic: bool,
+        walls: bool = False,
+        absolute: bool = False,
+    ):
         super().__init__()
         if absolute and spec.periodic:
             raise ValueError("a periodic box has no absolute places; set encoder: relative")

@@ -27,18 +27,32 @@ from learn.generalisation import Trial, groups, trials  # noqa: E402
 from sim.errors import InputError  # noqa: E402
 from sim.trajectory import atomic_path  # noqa: E402
 
-COLOURS = {
-    "reference": "#000000", "solver": "#0072B2", "learned": "#D55E00", "trivial": "#7A7A7A", "oracle": "#009E73", "floor": "#CC79A7",
-}
+COLOURS = {"reference": "#000000", "solver": "#0072B2", "learned": "#D55E00", "trivial": "#7A7A7A", "oracle": "#009E73", "floor": "#CC79A7"}
 MARKERS = {"reference": "*", "solver": "o", "learned": "s", "trivial": "X", "oracle": "D", "floor": "_"}
 KIND_NAMES = {
-    "reference": "reference", "solver": "solver ladder", "learned": "learned", "trivial": "trivial", "oracle": "oracle", "floor": "chaos floor",
+    "reference": "reference",
+    "solver": "solver ladder",
+    "learned": "learned",
+    "trivial": "trivial",
+    "oracle": "oracle",
+    "floor": "chaos floor",
 }
 _DASHES = ("-", (0, (5, 1.5)), (0, (1, 1.2)), (0, (4, 1.2, 1, 1.2)))
 _STYLE = {
-    "font.size": 10, "axes.titlesize": 11, "axes.spines.top": False, "axes.spines.right": False, "axes.grid": True, "grid.color": "#E4E4E4",
-    "grid.linewidth": 0.7, "axes.axisbelow": True, "figure.facecolor": "white", "savefig.facecolor": "white", "savefig.dpi": 150,
-    "svg.hashsalt": "sluice", "legend.frameon": False, "legend.fontsize": 9,
+    "font.size": 10,
+    "axes.titlesize": 11,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.color": "#E4E4E4",
+    "grid.linewidth": 0.7,
+    "axes.axisbelow": True,
+    "figure.facecolor": "white",
+    "savefig.facecolor": "white",
+    "savefig.dpi": 150,
+    "svg.hashsalt": "sluice",
+    "legend.frameon": False,
+    "legend.fontsize": 9,
 }
 
 
@@ -262,7 +276,8 @@ def speed_ups(analysis: Sequence[dict], path: str | Path) -> None:
         axes.set_xlim(min(low, 0.5) / (1 + 3 * (not set(outcomes) <= _OUTCOMES.keys())), max(high, 2))
         handles = [
             plt.Line2D([], [], ls="", marker=marker, color=COLOURS[kind], label=f"at equal error: {outcome}")
-            for outcome, (marker, kind) in _OUTCOMES.items() if outcome in outcomes
+            for outcome, (marker, kind) in _OUTCOMES.items()
+            if outcome in outcomes
         ]
         paper = "over the reference, accuracy aside"
         handles.append(plt.Line2D([], [], ls="", marker="o", color=COLOURS["reference"], markerfacecolor="white", label=paper))
@@ -409,8 +424,14 @@ def training_curve(runs: Mapping[str, str | Path], path: str | Path) -> None:
             validation = _read_columns(Path(folder) / "validation.csv", ("step", "seconds", "rollout_mse"))
             steps = int(log["step"][-1]) if len(log["step"]) else 0
             above.plot(log["seconds"] / 60, log["loss"], color=colour, lw=0.6, alpha=0.3)
-            above.plot(log["seconds"] / 60, _smooth(log["loss"], max(len(log["loss"]) // 30, 1)), color=colour, ls=dash, lw=1.8,
-                       label=f"{label} ({steps:,} steps)")
+            above.plot(
+                log["seconds"] / 60,
+                _smooth(log["loss"], max(len(log["loss"]) // 30, 1)),
+                color=colour,
+                ls=dash,
+                lw=1.8,
+                label=f"{label} ({steps:,} steps)",
+            )
             below.plot(validation["seconds"] / 60, validation["rollout_mse"], color=colour, ls=dash, lw=1.6, marker="o", markersize=4)
         above.set(yscale="log", ylabel="training loss", title="training")
         below.set(yscale="log", ylabel="validation rollout MSE, length²", xlabel="training time, minutes")

@@ -196,8 +196,24 @@ class Search:
 
         def kernel(write: bool) -> None:
             _neighbours_kernel[(len(position),)](
-                position, cell, order, starts, particles, offsets, sender, receiver, counts, self.limit, self.capacity,
-                *self.shape, DIM=self.dim, CHUNK=32, SELF=self.self_edges, WRITE=write, num_warps=1)
+                position,
+                cell,
+                order,
+                starts,
+                particles,
+                offsets,
+                sender,
+                receiver,
+                counts,
+                self.limit,
+                self.capacity,
+                *self.shape,
+                DIM=self.dim,
+                CHUNK=32,
+                SELF=self.self_edges,
+                WRITE=write,
+                num_warps=1,
+            )
 
         kernel(False)
         torch.cumsum(counts, 0, out=offsets[1:])
@@ -325,7 +341,8 @@ def _segment_sum_kernel(values, order, offsets, out, LATENT: tl.constexpr, CHUNK
 def _segment_sum(values: Tensor, graph: PaddedGraph, out: Tensor, order: Tensor | None = None) -> Tensor:
     """out [particles, latent]: sums of values [capacity, latent] over each particle's edges, taken through ``order``."""
     _segment_sum_kernel[(graph.particles,)](
-        values, values if order is None else order, graph.offsets, out, LATENT=values.shape[1], CHUNK=8, ORDERED=order is not None, num_warps=1)
+        values, values if order is None else order, graph.offsets, out, LATENT=values.shape[1], CHUNK=8, ORDERED=order is not None, num_warps=1
+    )
     return out
 
 
@@ -393,8 +410,19 @@ def _tiled(values: Tensor, tile: int) -> TensorDescriptor:
     return TensorDescriptor.from_tensor(values, [tile, values.shape[1]])
 
 
-def _run_forward(kind: str, weights: Weights, x: Tensor, out: Tensor | None, count: Tensor, *, keep: bool, x2: Tensor | None = None,
-                 table: Tensor | None = None, graph: Any = None, message: Tensor | None = None) -> _Kept | None:
+def _run_forward(
+    kind: str,
+    weights: Weights,
+    x: Tensor,
+    out: Tensor | None,
+    count: Tensor,
+    *,
+    keep: bool,
+    x2: Tensor | None = None,
+    table: Tensor | None = None,
+    graph: Any = None,
+    message: Tensor | None = None,
+) -> _Kept | None:
     from learn.gns import NORM_EPSILON
 
     tile, warps = FORWARD[kind]
@@ -412,8 +440,19 @@ def _run_forward(kind: str, weights: Weights, x: Tensor, out: Tensor | None, cou
     return kept
 
 
-def _run_backward(kind: str, weights: Weights, x: Tensor, kept: _Kept, count: Tensor, grad_out: Tensor | None, grad_x: Tensor, *,
-                  grad_x2: Tensor | None = None, graph: Any = None, grad_sums: Tensor | None = None):
+def _run_backward(
+    kind: str,
+    weights: Weights,
+    x: Tensor,
+    kept: _Kept,
+    count: Tensor,
+    grad_out: Tensor | None,
+    grad_x: Tensor,
+    *,
+    grad_x2: Tensor | None = None,
+    graph: Any = None,
+    grad_sums: Tensor | None = None,
+):
     """Writes grad_x and grad_x2; returns the gradients after W2, W1, W0 [3, rows, latent] and those of [b0, b1, b2, gamma, beta]."""
     tile, warps = BACKWARD[kind]
     (_, padded, latent), rows, edge = kept.hidden.shape, len(x), kind == "edge"
@@ -483,8 +522,18 @@ class _Block(torch.autograd.Function):
     """One block of message passing; the edges' gradient comes back from the next block alone."""
 
     @staticmethod
-    def forward(ctx, edge: Weights, node: Weights, graph: PaddedGraph, count: Tensor, update: bool, keep: bool, nodes: Tensor, edges: Tensor,
-                *parameters: Tensor):
+    def forward(
+        ctx,
+        edge: Weights,
+        node: Weights,
+        graph: PaddedGraph,
+        count: Tensor,
+        update: bool,
+        keep: bool,
+        nodes: Tensor,
+        edges: Tensor,
+        *parameters: Tensor,
+    ):
         low = nodes.to(edge.first.dtype)
         table = torch.bmm(low.expand(2, -1, -1), _pair(edge).mT)
         message = torch.empty_like(edges)
@@ -560,7 +609,16 @@ def forward(network: Network, nodes: Tensor, edges: Tensor, graph: PaddedGraph) 
     for _ in range(network.repeats):
         for block in network.processor:
             nodes, updated = _Block.apply(
-                shadow[block.edge], shadow[block.node], graph, rows, block.edge_update, keep, nodes, edges,
-                *_parameters(block.edge), *_parameters(block.node))
+                shadow[block.edge],
+                shadow[block.node],
+                graph,
+                rows,
+                block.edge_update,
+                keep,
+                nodes,
+                edges,
+                *_parameters(block.edge),
+                *_parameters(block.node),
+            )
             edges = edges if updated is None else updated
     return network.decode(nodes, dtype)

@@ -146,8 +146,7 @@ def _bag_sum(values: Tensor, order: Tensor, offsets: Tensor) -> Tensor:
     return torch.embedding_bag(values, order, offsets, mode=0, include_last_offset=True)[0]
 
 
-def _edge_pass(graph: Graph, dtype: torch.dtype, table: Tensor, edges: Tensor, first: Tensor, rest: tuple[Tensor, ...], update: bool,
-               keep: bool):
+def _edge_pass(graph: Graph, dtype: torch.dtype, table: Tensor, edges: Tensor, first: Tensor, rest: tuple[Tensor, ...], update: bool, keep: bool):
     """Messages m = MLP[e, v_r, v_s], their sums over each receiver's edges, and e + m (None without ``update``), one run of edges after the other.
 
     table [particles, 2, latent]: the particles' share of the first layer, as receiver (bias included) and as sender; edges
@@ -222,7 +221,8 @@ class _EdgeUpdate(torch.autograd.Function):
             gradient = grad_sums.index_select(0, graph.receiver[at])
             gradient.add_(grad_edges[at])
             gradient, gamma_part, beta_part = torch.ops.aten.native_layer_norm_backward(
-                gradient, z[at].to(gamma.dtype), [len(gamma)], mean[at], rstd[at], gamma, beta, [True, True, True])
+                gradient, z[at].to(gamma.dtype), [len(gamma)], mean[at], rstd[at], gamma, beta, [True, True, True]
+            )
             grad_gamma += gamma_part
             grad_beta += beta_part
             gradient = gradient.to(dtype)
@@ -347,9 +347,16 @@ class GNS(nn.Module):
         self.sigma = settings.noise * scale
         self.radius = spec.radius if settings.radius is None else settings.radius * spec.spacing
         self.features = Features(
-            spec, sigma=self.sigma, velocities=self.velocities, radius=self.radius, scaling=settings.inputs,
+            spec,
+            sigma=self.sigma,
+            velocities=self.velocities,
+            radius=self.radius,
+            scaling=settings.inputs,
             wall_distance=self.radius if settings.wall_distance is None else settings.wall_distance * spec.spacing,
-            absolute=settings.encoder == "absolute", relative_velocity=settings.relative_velocity, ballistic=settings.ballistic, walls=settings.walls,
+            absolute=settings.encoder == "absolute",
+            relative_velocity=settings.relative_velocity,
+            ballistic=settings.ballistic,
+            walls=settings.walls,
         )
         self.network = Network(settings, self.features.node_width, self.features.edge_width, spec.dim)
         self.search: Search | None = None  # of graphs on the device, where steps are replayed
@@ -426,8 +433,7 @@ class GNS(nn.Module):
         return total / calls
 
     def _predict(
-        self, position: Tensor, graph: Graph, particle_type: Tensor, bounds: Tensor, context: Tensor | None,
-        period: np.ndarray | None = None,
+        self, position: Tensor, graph: Graph, particle_type: Tensor, bounds: Tensor, context: Tensor | None, period: np.ndarray | None = None
     ) -> Tensor:
         output = self.network(self.features.nodes(position, particle_type, bounds, context), self.features.edges(position, graph, period), graph)
         if self.options.flight_below:

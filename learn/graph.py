@@ -81,9 +81,7 @@ class Run:
     pairs: Tensor
 
 
-def radius_graph(
-    position: Tensor, radius: float, example: Tensor | None = None, self_edges: bool = True, period: np.ndarray | None = None
-) -> Graph:
+def radius_graph(position: Tensor, radius: float, example: Tensor | None = None, self_edges: bool = True, period: np.ndarray | None = None) -> Graph:
     """All ordered pairs with |x_i - x_j| <= radius, no cap on the neighbours (Sanchez-Gonzalez et al. 2020).
 
     position [particles, dim], length; radius: length; example [particles], ascending: pairs join only within one example (None: there

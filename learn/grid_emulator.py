@@ -326,9 +326,11 @@ class GridEmulator(nn.Module):
         coordinate = (torch.div((node % size)[:, None], self.grid.stride0, rounding_mode="floor") % padded - 1).float()
         walls = torch.cat([coordinate - self.options.margin, self.nodes - 1 - self.options.margin - coordinate], 1)
         parts = [
-            density, (velocity[:, :, 0] / self.velocity_scale).flatten(1),
+            density,
+            (velocity[:, :, 0] / self.velocity_scale).flatten(1),
             ((velocity[:, :, :-1] - velocity[:, :, 1:]) / self.acceleration_scale).flatten(1),
-            walls.clamp(-reach, reach) / reach, (ahead - 1).clamp(-1, 3),
+            walls.clamp(-reach, reach) / reach,
+            (ahead - 1).clamp(-1, 3),
         ]
         if self.context:
             parts.append(((context - self.context_mean) / self.context_std)[node // size])

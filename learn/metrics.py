@@ -227,9 +227,7 @@ def density(position: np.ndarray, bounds: np.ndarray, cell: float, spacing: floa
     return grid * np.prod(spacing / edge)
 
 
-def density_error(
-    p: np.ndarray, q: np.ndarray, bounds: np.ndarray, spacing: float, period: np.ndarray | None = None
-) -> tuple[float, float]:
+def density_error(p: np.ndarray, q: np.ndarray, bounds: np.ndarray, spacing: float, period: np.ndarray | None = None) -> tuple[float, float]:
     """(mean, max) of |density(p) - density(q)| over the nodes where either is not zero; grid of two spacings, in rest densities."""
     first, second = (density(cloud, bounds, 2 * spacing, spacing, period) for cloud in (p, q))
     used = (first > 0) | (second > 0)
@@ -311,8 +309,16 @@ def pile_angle(position: np.ndarray, bounds: np.ndarray, gravity: np.ndarray, sp
 
 #: What ``cloud_metrics`` measures.
 CLOUD_METRICS = (
-    "sinkhorn", "emd", "spacing_ratio", "density_error_mean", "density_error_max", "centre_of_mass_error", "front_error", "width_ratio",
-    "height_ratio", "pile_angle_error",
+    "sinkhorn",
+    "emd",
+    "spacing_ratio",
+    "density_error_mean",
+    "density_error_max",
+    "centre_of_mass_error",
+    "front_error",
+    "width_ratio",
+    "height_ratio",
+    "pile_angle_error",
 )
 
 
@@ -353,8 +359,13 @@ def cloud_metrics(p: np.ndarray, q: np.ndarray, trajectory: Trajectory, *, emd_p
 
 
 def evaluate(
-    predicted: np.ndarray, trajectory: Trajectory, present: int, *, horizons: tuple[int, ...] = HORIZONS,
-    emd_particles: int = 500, sinkhorn_particles: int = 300,
+    predicted: np.ndarray,
+    trajectory: Trajectory,
+    present: int,
+    *,
+    horizons: tuple[int, ...] = HORIZONS,
+    emd_particles: int = 500,
+    sinkhorn_particles: int = 300,
 ) -> dict:
     """Every metric of one rollout: predicted [frames, particles, dim] are the frames after ``present`` of the true trajectory.
 

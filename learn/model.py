@@ -57,11 +57,7 @@ def check_start(start: Start, spec: DataSpec, history: int) -> None:
 
 
 #: name -> module and class, imported when built.
-MODELS = {
-    "gns": ("learn.gns", "GNS"),
-    "grid_emulator": ("learn.grid_emulator", "GridEmulator"),
-    "cconv": ("learn.cconv", "CConv"),
-}
+MODELS = {"gns": ("learn.gns", "GNS"), "grid_emulator": ("learn.grid_emulator", "GridEmulator"), "cconv": ("learn.cconv", "CConv")}
 
 
 def model_class(name: str) -> type[LearnedModel]:

@@ -38,8 +38,7 @@ class Relaxation(BaseModel):
 
 
 def relax(
-    position: np.ndarray, bounds: np.ndarray, spacing: float, settings: Relaxation, fixed: np.ndarray | None = None,
-    period: np.ndarray | None = None,
+    position: np.ndarray, bounds: np.ndarray, spacing: float, settings: Relaxation, fixed: np.ndarray | None = None, period: np.ndarray | None = None
 ) -> np.ndarray:
     """Positions [particles, dim] float64 after ``settings.loops`` steps; bounds [dim, 2] and spacing in the same length.
 
@@ -77,9 +76,7 @@ def relax(
     return position + outside
 
 
-def images(
-    position: np.ndarray, bounds: np.ndarray, reach: float, period: np.ndarray | None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def images(position: np.ndarray, bounds: np.ndarray, reach: float, period: np.ndarray | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The particles, then their images within ``reach`` of the box, corners included: owner [k], sign and shift [k, dim] (x sign + shift).
 
     Images are mirrored in walls and a period away along periodic axes.

@@ -23,7 +23,11 @@ from sim.trajectory import atomic_folder, atomic_path
 
 #: Kinds of contenders in the order of the tables, as headings of the groups.
 KINDS = {
-    "reference": "reference", "solver": "solver ladder", "learned": "learned", "trivial": "trivial baselines", "oracle": "oracle",
+    "reference": "reference",
+    "solver": "solver ladder",
+    "learned": "learned",
+    "trivial": "trivial baselines",
+    "oracle": "oracle",
     "floor": "chaos floor",
 }
 _DASH = "–"
@@ -178,7 +182,8 @@ def _contenders(rows: Sequence[dict]) -> _Table:
     two = any(_at(row, "rollout_mse", at) != _at(row, "rollout_mse_moving", at) for row in rows for at in horizons)
     names = ["one step", *_horizon_names(horizons)]
     table = _Table(
-        "Contenders: medians over the test trajectories; in small print the least and the greatest", names[:],
+        "Contenders: medians over the test trajectories; in small print the least and the greatest",
+        names[:],
         [("MSE, all particles" if two else "MSE", len(names))],
     )
     if two:
@@ -223,13 +228,18 @@ def _time_cells(table: _Table, row: Mapping) -> list[_Cell]:
         per_frame = _Cell(duration(seconds), f"{duration(low)} to {duration(high)}" if low is not None else "")
     simulated = row.get("seconds_per_simulated_second")
     return [
-        per_frame, table.missing(None) if simulated is None else _Cell(duration(simulated)),
+        per_frame,
+        table.missing(None) if simulated is None else _Cell(duration(simulated)),
         table.missing("timed in the rollouts of the comparison only, not interleaved") if compiling is None else _Cell(duration(compiling)),
     ]
 
 
 _OUTCOMES = {
-    "wins": "wins", "loses": "loses", "ties": "ties", "worse than trivial": "worse than a trivial baseline", "no rung": "no rung as accurate",
+    "wins": "wins",
+    "loses": "loses",
+    "ties": "ties",
+    "worse than trivial": "worse than a trivial baseline",
+    "no rung": "no rung as accurate",
     "failed": "failed",
 }
 
@@ -246,8 +256,15 @@ def _speed_ups(entries: Sequence[dict]) -> _Table:
     table = _Table(
         f"What the learning bought; error: {entries[0]['yardstick']}",
         [
-            "over the reference, accuracy aside", "at equal error", "against", "model's error", "rung's error", "ratio", "against",
-            "at equal error", "over the reference",
+            "over the reference, accuracy aside",
+            "at equal error",
+            "against",
+            "model's error",
+            "rung's error",
+            "ratio",
+            "against",
+            "at equal error",
+            "over the reference",
         ],
         [("speed-up", 3), ("error at equal time", 4), ("break-even, rollouts", 2)],
     )
@@ -325,8 +342,12 @@ def _glance(scenes: Sequence[dict], folder: str) -> _Table:
         trivial = [error for row in rows if row["kind"] == "trivial" and (error := MOVING_MSE.of(row)) is not None]
         speed = next(row.cells for row in _speed_ups([best]).rows)
         cells = [
-            _Cell(best["contender"]), _Cell(number(best["error"])), _Cell(number(min(trivial))) if trivial else table.missing("none compared"),
-            _Cell(duration(best["seconds_per_frame"])), speed[1], speed[2],
+            _Cell(best["contender"]),
+            _Cell(number(best["error"])),
+            _Cell(number(min(trivial))) if trivial else table.missing("none compared"),
+            _Cell(duration(best["seconds_per_frame"])),
+            speed[1],
+            speed[2],
             table.missing("reference not timed") if best["speed_up_paper"] is None else speed[0],
             table.missing("what data and training cost is unknown, or nothing is saved") if speed[7].text == _DASH else speed[7],
         ]
@@ -338,7 +359,8 @@ def _published(scenes: Sequence[dict]) -> _Table | None:
     """Learned models on scenes that reproduce a domain of the paper, beside its Table 1; None where there are none."""
     columns = ["one step", "all frames", "ours / paper", "model", "parameters", "trajectories", "steps", "took", "particles", "frames"]
     table = _Table(
-        "Beside Table 1 of Sanchez-Gonzalez et al. (2020), whose figures are in small print", columns,
+        "Beside Table 1 of Sanchez-Gonzalez et al. (2020), whose figures are in small print",
+        columns,
         [("MSE, all particles", 3), ("network", 2), ("training", 3), ("test", 2)],
     )
     for scene in scenes:
@@ -361,10 +383,13 @@ def _published(scenes: Sequence[dict]) -> _Table | None:
                 _Cell(number(one_step), number(domain.one_step_mse)) if one_step is not None else table.missing(failed),
                 _Cell(number(rollout), number(domain.rollout_mse)) if rollout is not None else table.missing(failed),
                 _Cell(f"{number(rollout / domain.rollout_mse)}×") if rollout is not None else table.missing(failed),
-                _Cell(words(row.get("settings", {}).get("model")).replace("_", " "), "gns"), beside(cost.get("parameters"), parameters),
-                beside(cost.get("trajectories"), domain.trajectories), beside(cost.get("steps"), TRAINING_STEPS),
+                _Cell(words(row.get("settings", {}).get("model")).replace("_", " "), "gns"),
+                beside(cost.get("parameters"), parameters),
+                beside(cost.get("trajectories"), domain.trajectories),
+                beside(cost.get("steps"), TRAINING_STEPS),
                 _Cell(duration(cost["training_seconds"]), words(cost.get("device"))) if cost else table.missing("not said beside the checkpoint"),
-                beside(sum(particles) / len(particles) if particles else None, domain.particles), beside(row["frames"], domain.steps),
+                beside(sum(particles) / len(particles) if particles else None, domain.particles),
+                beside(row["frames"], domain.steps),
             ]
             table.rows.append(_Row(row["contender"], cells, heading))
             heading = None
@@ -411,10 +436,14 @@ def _scenes(rows: Sequence[dict], analysis: Sequence[dict]) -> list[dict]:
     result = []
     for (scene, reference), members in groups.items():
         alone = scenes.count(scene) == 1
-        result.append({
-            "name": scene if alone else f"{scene}, truth: {reference}", "slug": scene if alone else f"{scene}-{reference}".replace(" ", "-"),
-            "rows": members, "analysis": entries.get((scene, reference), []),
-        })
+        result.append(
+            {
+                "name": scene if alone else f"{scene}, truth: {reference}",
+                "slug": scene if alone else f"{scene}-{reference}".replace(" ", "-"),
+                "rows": members,
+                "analysis": entries.get((scene, reference), []),
+            }
+        )
     return result
 
 
@@ -423,7 +452,8 @@ def _page(scene: Mapping, media: SceneAssets) -> dict:
     rows, entries = scene["rows"], scene["analysis"]
     first = rows[0]
     facts = [
-        f"truth: {first['reference']}", f"{first['trajectories']} test trajectories" if first.get("trajectories") else "",
+        f"truth: {first['reference']}",
+        f"{first['trajectories']} test trajectories" if first.get("trajectories") else "",
         f"{first['frames']} predicted frames of {duration(first['frame_step'])}" if first.get("frames") and first.get("frame_step") else "",
         f"{first['known_frames']} known frames" if first.get("known_frames") else "",
     ]
@@ -432,16 +462,21 @@ def _page(scene: Mapping, media: SceneAssets) -> dict:
     still = [_Media(film.poster, "still", f"{film.caption} Half way.", None, False) for film in films[:1] if film.poster]
     holds = ["films" if films else "", "curves over time" if media.figures else "", "trainings" if media.training else "", "settings"]
     return {
-        "name": scene["name"], "slug": scene["slug"], "facts": ", ".join(fact for fact in facts if fact), "verdict": scene_verdict(rows),
-        "main": [*still, *main], "moving": [*films, *_embed(media.stills)], "figures": [*main, *_embed(media.figures)],
-        "training": _embed(media.training), "tables": [table for table in tables if table], "holds": ", ".join(part for part in holds if part),
+        "name": scene["name"],
+        "slug": scene["slug"],
+        "facts": ", ".join(fact for fact in facts if fact),
+        "verdict": scene_verdict(rows),
+        "main": [*still, *main],
+        "moving": [*films, *_embed(media.stills)],
+        "figures": [*main, *_embed(media.figures)],
+        "training": _embed(media.training),
+        "tables": [table for table in tables if table],
+        "holds": ", ".join(part for part in holds if part),
         "settings": [(row["contender"], json.dumps(row.get("settings", {}), sort_keys=True)) for row in _by_kind(rows)],
     }
 
 
-def write_report(
-    summary: Mapping, path: str | Path, assets: Mapping[str, SceneAssets] | None = None, overview: Sequence[Asset] = (),
-) -> None:
+def write_report(summary: Mapping, path: str | Path, assets: Mapping[str, SceneAssets] | None = None, overview: Sequence[Asset] = ()) -> None:
     """Write the entry to ``path`` (NAME.html), last, and a page for every scene and reference to the folder NAME beside it, which is replaced.
 
     summary: as in ``learn.compare`` with "rows", "verdict" (the first paragraph), "hardware", "versions"; optional "title", "analysis" (by
@@ -463,15 +498,29 @@ def write_report(
     provenance = {name: summary.get(name) or {} for name in ("hardware", "versions")} | (summary.get("provenance") or {})
     here = Path(__file__).parent
     entry = render(
-        here / "report_template.html", title=title, verdict=summary["verdict"], folder=folder.name, pages=pages, overview=_embed(overview),
-        glance=_glance(scenes, folder.name), published=_published(scenes), costs=_all_costs(rows),
-        jobs=_jobs(summary["jobs"]) if summary.get("jobs") else None, provenance={name: content for name, content in provenance.items() if content},
+        here / "report_template.html",
+        title=title,
+        verdict=summary["verdict"],
+        folder=folder.name,
+        pages=pages,
+        overview=_embed(overview),
+        glance=_glance(scenes, folder.name),
+        published=_published(scenes),
+        costs=_all_costs(rows),
+        jobs=_jobs(summary["jobs"]) if summary.get("jobs") else None,
+        provenance={name: content for name, content in provenance.items() if content},
     )
     machine = ", ".join(words(hardware[key]) for key in ("cpu", "gpu") if hardware.get(key)) or "an unknown machine"
     with atomic_folder(folder) as temporary:
         for page in pages:
             text = render(
-                here / "scene_template.html", title=f"{page['name']}: {title}", study=title, entry=path.name, page=page, pages=pages, machine=machine,
+                here / "scene_template.html",
+                title=f"{page['name']}: {title}",
+                study=title,
+                entry=path.name,
+                page=page,
+                pages=pages,
+                machine=machine,
                 provenance={},
             )
             (temporary / f"{page['slug']}.html").write_bytes(text)

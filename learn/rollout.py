@@ -54,8 +54,15 @@ def _predicted(trajectory: Trajectory, known: int, result: Rollout, simulator: d
     finite = int(np.isfinite(result.position).all(axis=(1, 2)).sum())
     position = np.concatenate([trajectory.position[:known], result.position[:finite]])
     predicted = Trajectory(
-        position=position, particle_type=trajectory.particle_type, frame_step=trajectory.frame_step, radius=trajectory.radius,
-        bounds=trajectory.bounds, scene=trajectory.scene, seed=trajectory.seed, simulator=simulator, status=result.status,
+        position=position,
+        particle_type=trajectory.particle_type,
+        frame_step=trajectory.frame_step,
+        radius=trajectory.radius,
+        bounds=trajectory.bounds,
+        scene=trajectory.scene,
+        seed=trajectory.seed,
+        simulator=simulator,
+        status=result.status,
         context=None if trajectory.context is None else trajectory.context[: len(position)],
     )
     return predicted, {"seconds": result.seconds, "begin_seconds": result.begin_seconds, "frames": finite, "escaped": result.escaped}
@@ -67,8 +74,15 @@ def _free(out: Path) -> None:
 
 
 def rollout_dataset(
-    checkpoint: str | Path, data: str | Path, split: str, out: str | Path, count: int | None = None, frames: int | None = None,
-    device: torch.device | str = "cpu", threads: int = 1, batch: int = 1,
+    checkpoint: str | Path,
+    data: str | Path,
+    split: str,
+    out: str | Path,
+    count: int | None = None,
+    frames: int | None = None,
+    device: torch.device | str = "cpu",
+    threads: int = 1,
+    batch: int = 1,
 ) -> dict:
     """Roll a checkpoint out over the first ``count`` trajectories of a split (None: all) into the shard ``out``.
 
@@ -89,8 +103,16 @@ def rollout_dataset(
 
 
 def rollout_scene(
-    checkpoint: str | Path, scene: str | Path, out: str | Path, variant: str | None = None, seed: int = 0, count: int = 1,
-    frames: int | None = None, device: torch.device | str = "cpu", threads: int = 1, batch: int = 1,
+    checkpoint: str | Path,
+    scene: str | Path,
+    out: str | Path,
+    variant: str | None = None,
+    seed: int = 0,
+    count: int = 1,
+    frames: int | None = None,
+    device: torch.device | str = "cpu",
+    threads: int = 1,
+    batch: int = 1,
 ) -> dict:
     """Roll a checkpoint out from the first frames of ``count`` draws of a scene file, those of the test split of a data set with base seed ``seed``.
 
@@ -129,8 +151,14 @@ def rollout_scene(
 
 
 def _write(
-    model: nn.Module, checkpoint: str | Path, starts: Iterable[tuple[int, Trajectory]], out: Path, frames: int | None,
-    device: torch.device | str, threads: int, batch: int,
+    model: nn.Module,
+    checkpoint: str | Path,
+    starts: Iterable[tuple[int, Trajectory]],
+    out: Path,
+    frames: int | None,
+    device: torch.device | str,
+    threads: int,
+    batch: int,
 ) -> dict:
     torch.set_num_threads(threads)
     simulator = {"name": model.name, "kind": model.kind, "settings": model.settings, "checkpoint": file_hash(checkpoint), "version": __version__}

@@ -209,7 +209,11 @@ def edge_gradient(
 
 
 def mlp(
-    inputs: list[Tensor], linears: list[tuple[Tensor, Tensor]], norm: tuple[Tensor, Tensor, float], dtype: torch.dtype, out: Tensor,
+    inputs: list[Tensor],
+    linears: list[tuple[Tensor, Tensor]],
+    norm: tuple[Tensor, Tensor, float],
+    dtype: torch.dtype,
+    out: Tensor,
     residual: bool = False,
 ) -> Tensor:
     """LayerNorm(MLP[inputs]), products in ``dtype``, for every row, into ``out`` or, with ``residual``, added to it; no gradient.

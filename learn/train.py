@@ -158,8 +158,22 @@ class Adam:
         lists = (self.parameters, [parameter.grad for parameter in self.parameters], self.mean, self.square)
         weights, gradients, mean, square = ([entries[k] for k in used] for entries in lists)
         adam(
-            weights, gradients, mean, square, [], [self.steps[k] for k in used], fused=True, found_inf=found_inf, amsgrad=False, maximize=False,
-            beta1=0.9, beta2=0.999, eps=1e-8, lr=rate, weight_decay=self.weight_decay, decoupled_weight_decay=True,
+            weights,
+            gradients,
+            mean,
+            square,
+            [],
+            [self.steps[k] for k in used],
+            fused=True,
+            found_inf=found_inf,
+            amsgrad=False,
+            maximize=False,
+            beta1=0.9,
+            beta2=0.999,
+            eps=1e-8,
+            lr=rate,
+            weight_decay=self.weight_decay,
+            decoupled_weight_decay=True,
         )
 
     def state(self) -> dict[str, list[Tensor]]:
@@ -294,8 +308,16 @@ class Trainer:
         self.sampler = Sampler(self.train_data, config.data, batch, self.settings.seed, self.settings.edges, self.processes)
         self.generator = torch.Generator().manual_seed(self.settings.seed)
         self.progress_state: dict[str, Any] = {
-            "step": 0, "seconds": 0.0, "validated_step": 0, "validations": 0, "best_mse": None, "best_step": None,
-            "loss_sum": 0.0, "norm_sum": 0.0, "logged": 0, "validation_seconds": 0.0,
+            "step": 0,
+            "seconds": 0.0,
+            "validated_step": 0,
+            "validations": 0,
+            "best_mse": None,
+            "best_step": None,
+            "loss_sum": 0.0,
+            "norm_sum": 0.0,
+            "logged": 0,
+            "validation_seconds": 0.0,
         }
         self._check_lengths()
         self._resume()
@@ -419,10 +441,17 @@ class Trainer:
             if self.board:
                 self.board.close()
         content = {
-            "steps": self.step, "seconds": self.seconds(), "validation_seconds": self.progress_state["validation_seconds"],
-            "best_rollout_mse": self.progress_state["best_mse"], "best_step": self.progress_state["best_step"],
-            "parameters": sum(parameter.numel() for parameter in self.parameters), "model": self.config.model,
-            "device": str(self.device), "threads": self.settings.threads, "processes": self.processes.size, "config": self._config_dict(),
+            "steps": self.step,
+            "seconds": self.seconds(),
+            "validation_seconds": self.progress_state["validation_seconds"],
+            "best_rollout_mse": self.progress_state["best_mse"],
+            "best_step": self.progress_state["best_step"],
+            "parameters": sum(parameter.numel() for parameter in self.parameters),
+            "model": self.config.model,
+            "device": str(self.device),
+            "threads": self.settings.threads,
+            "processes": self.processes.size,
+            "config": self._config_dict(),
         }
         write_json(done, content)
         return content
@@ -611,8 +640,13 @@ class Trainer:
 
     def _provenance(self) -> dict:
         return {
-            "config": self._config_dict(), "step": self.step, "seconds": self.seconds(), "rollout_mse": self.progress_state["best_mse"],
-            "scene": self.train_data.content.get("scene"), "trajectories": len(self.train_data), "device": str(self.device),
+            "config": self._config_dict(),
+            "step": self.step,
+            "seconds": self.seconds(),
+            "rollout_mse": self.progress_state["best_mse"],
+            "scene": self.train_data.content.get("scene"),
+            "trajectories": len(self.train_data),
+            "device": str(self.device),
             "versions": {"sluice": __version__, "torch": torch.__version__},
         }
 
@@ -624,10 +658,16 @@ class Trainer:
         self.validation.sync()
         self.progress_state["seconds"] = self.seconds()
         state = {
-            "config": self._config_dict(), "spec": json.loads(json.dumps(self.spec.to_dict())), "model": self.model.state_dict(),
-            "average": self.average, "optimizer": self.optimizer.state(), "sampler": self.sampler.state(),
-            "generator": self.generator.get_state(), "torch_random": torch.get_rng_state(),
-            "device_random": [torch.cuda.get_rng_state(self.device)] if self.device.type == "cuda" else [], "progress": dict(self.progress_state),
+            "config": self._config_dict(),
+            "spec": json.loads(json.dumps(self.spec.to_dict())),
+            "model": self.model.state_dict(),
+            "average": self.average,
+            "optimizer": self.optimizer.state(),
+            "sampler": self.sampler.state(),
+            "generator": self.generator.get_state(),
+            "torch_random": torch.get_rng_state(),
+            "device_random": [torch.cuda.get_rng_state(self.device)] if self.device.type == "cuda" else [],
+            "progress": dict(self.progress_state),
         }
         assert set(state) == set(STATE_KEYS)
         save_state(self.folder / "checkpoint.pt", state)
@@ -710,4 +750,3 @@ def _at(content: object, key: str) -> object:
 def train(config: Config, data: str | Path, run: str | Path, where: object = "config") -> dict:
     """Train to the end of the budget, resuming what ``run`` holds; returns the content of ``done.json`` (see ``Trainer``)."""
     return Trainer(config, data, run, where).run()
-

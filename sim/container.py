@@ -58,7 +58,9 @@ class ContainerFamily(Strict):
     def draw(self, rng: np.random.Generator) -> Container:
         """One shaking, its numbers fixed."""
         phase = (0.0, 360.0) if self.phase == "any" else self.phase
-        return Container(sines=[
-            Sine(amplitude=[sample(value, rng) for value in self.amplitude], frequency=sample(self.frequency, rng), phase=sample(phase, rng))
-            for _ in range(int(rng.integers(self.sines[0], self.sines[1] + 1)))
-        ])
+        return Container(
+            sines=[
+                Sine(amplitude=[sample(value, rng) for value in self.amplitude], frequency=sample(self.frequency, rng), phase=sample(phase, rng))
+                for _ in range(int(rng.integers(self.sines[0], self.sines[1] + 1)))
+            ]
+        )

@@ -255,8 +255,7 @@ def velocities(position: np.ndarray, frames: Sequence[int], frame_step: float, p
 
 
 def _write_vtkhdf(
-    path: Path, position: np.ndarray, kinds: np.ndarray, context: dict[str, np.ndarray], frame_step: float, frames: range,
-    period: np.ndarray | None,
+    path: Path, position: np.ndarray, kinds: np.ndarray, context: dict[str, np.ndarray], frame_step: float, frames: range, period: np.ndarray | None
 ) -> None:
     """A transient PolyData of vertices: points and velocities of all steps one after another, all else once. The context is field data.
 
@@ -277,9 +276,13 @@ def _write_vtkhdf(
         root.create_group("Steps").attrs["NSteps"] = count
         arrays |= {
             "Steps/Values": np.array([frame * frame_step for frame in frames]),
-            "Steps/PartOffsets": shared, "Steps/NumberOfParts": np.ones(count, np.int64),
-            "Steps/PointOffsets": moving, "Steps/PointDataOffsets/velocity": moving, "Steps/PointDataOffsets/particle_type": shared,
-            "Steps/CellOffsets": np.zeros((count, 4), np.int64), "Steps/ConnectivityIdOffsets": np.zeros((count, 4), np.int64),
+            "Steps/PartOffsets": shared,
+            "Steps/NumberOfParts": np.ones(count, np.int64),
+            "Steps/PointOffsets": moving,
+            "Steps/PointDataOffsets/velocity": moving,
+            "Steps/PointDataOffsets/particle_type": shared,
+            "Steps/CellOffsets": np.zeros((count, 4), np.int64),
+            "Steps/ConnectivityIdOffsets": np.zeros((count, 4), np.int64),
         }
         for name, rows in context.items():
             rows = _in_space(rows) if name == _ACCELERATION else rows
@@ -350,7 +353,9 @@ def _metadata(source: _Source, format: str, exported: Exported) -> dict:
         "dim": first["dim"],
         "dt": first["frame_step"],
         "source": {
-            "generator": f"sluice {__version__}", "scene": content["scene"], "seed": content["seed"],
+            "generator": f"sluice {__version__}",
+            "scene": content["scene"],
+            "seed": content["seed"],
             "trajectories": exported.trajectories,
             "failed": {name: [number for split, number, _ in exported.failed if split == name] for name in source.shards},
             "left_out": exported.left_out,
@@ -377,9 +382,13 @@ def _metadata(source: _Source, format: str, exported: Exported) -> dict:
     if format == "lagrangebench":
         counts = exported.trajectories
         metadata |= {
-            "dx": first["spacing"], "write_every": 1, "num_particles_max": most,
-            "sequence_length_train": first["frames"], "num_trajs_train": counts.get("train", 0),
-            "sequence_length_test": first["frames"], "num_trajs_test": counts.get("test", 0),
+            "dx": first["spacing"],
+            "write_every": 1,
+            "num_particles_max": most,
+            "sequence_length_train": first["frames"],
+            "num_trajs_train": counts.get("train", 0),
+            "sequence_length_test": first["frames"],
+            "num_trajs_test": counts.get("test", 0),
             "periodic_boundary_conditions": first["periodic"],
         }
     return metadata

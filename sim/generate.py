@@ -104,9 +104,17 @@ def simulate(teacher: Teacher, scene: Scene) -> Trajectory:
     settings = {"name": teacher.name, "kind": teacher.kind, "settings": teacher.settings, "version": __version__}
     context = scene.context_values()
     return Trajectory(
-        position=position[:done], particle_type=kinds, frame_step=scene.frame_step, radius=scene.radius,
-        bounds=np.asarray(scene.bounds, float), scene=scene.to_dict(), seed=scene.seed, simulator=settings, status=status,
-        context=None if context is None else context[:done], diagnostics={name: np.asarray(values[:done]) for name, values in diagnostics.items()},
+        position=position[:done],
+        particle_type=kinds,
+        frame_step=scene.frame_step,
+        radius=scene.radius,
+        bounds=np.asarray(scene.bounds, float),
+        scene=scene.to_dict(),
+        seed=scene.seed,
+        simulator=settings,
+        status=status,
+        context=None if context is None else context[:done],
+        diagnostics={name: np.asarray(values[:done]) for name, values in diagnostics.items()},
     )
 
 
@@ -213,7 +221,8 @@ def _split_fault(entry: object) -> tuple[str, object] | None:
         return "", entry
     cost = entry.get("cost") or {}
     sound = {
-        "trajectories": type(entry.get("trajectories")) is int, "ok": type(entry.get("ok")) is int,
+        "trajectories": type(entry.get("trajectories")) is int,
+        "ok": type(entry.get("ok")) is int,
         "shards": isinstance(entry.get("shards"), list) and all(isinstance(shard, str) and "\0" not in shard for shard in entry["shards"]),
         "failed": isinstance(entry.get("failed"), list)
         and all(isinstance(one, dict) and {"index", "seed", "status"} <= one.keys() and type(one["index"]) is int for one in entry["failed"]),

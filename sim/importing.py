@@ -70,6 +70,7 @@ _LAGRANGEBENCH_TYPES = {0: PARTICLE_TYPES["water"], 1: KINEMATIC_TYPE, 2: KINEMA
 #: Particle types that a learner embeds.
 _TYPE_SLOTS = 9
 
+
 @dataclass(frozen=True)
 class Comparison:
     """A statistic of the training split [axes]: as found, as stated by the source (None: it does not say)."""
@@ -258,8 +259,14 @@ def _trajectory(source: _Source, file: Path, number: int, raw: _Raw, spacing: fl
     position, kinds, context = _checked(source, file, number, raw)
     metadata = source.metadata
     scene: dict[str, Any] = {
-        "name": _name(source.path), "dim": metadata.dim, "bounds": [list(ends) for ends in metadata.bounds], "gravity": source.gravity,
-        "frame_step": source.frame_step, "frames": len(position), "radius": metadata.default_connectivity_radius, "spacing": spacing,
+        "name": _name(source.path),
+        "dim": metadata.dim,
+        "bounds": [list(ends) for ends in metadata.bounds],
+        "gravity": source.gravity,
+        "frame_step": source.frame_step,
+        "frames": len(position),
+        "radius": metadata.default_connectivity_radius,
+        "spacing": spacing,
     }
     scene |= {"periodic": source.axes} if source.axes else {}
     # Of DeepMind's context nobody says what it is.
@@ -267,8 +274,14 @@ def _trajectory(source: _Source, file: Path, number: int, raw: _Raw, spacing: fl
     imported = {"format": source.format, "file": file.name, "number": number, "spacing": spacing_from}
     maker = metadata.solver if source.format == "lagrangebench" and metadata.solver else "unknown"
     return Trajectory(
-        position=position, particle_type=kinds, frame_step=source.frame_step, radius=metadata.default_connectivity_radius,
-        bounds=np.array(metadata.bounds), scene=scene, seed=None, context=context,
+        position=position,
+        particle_type=kinds,
+        frame_step=source.frame_step,
+        radius=metadata.default_connectivity_radius,
+        bounds=np.array(metadata.bounds),
+        scene=scene,
+        seed=None,
+        context=context,
         simulator={"name": maker, "kind": "reference", "settings": {}, "imported": imported, "version": __version__},
     )
 

@@ -19,10 +19,24 @@ from sim.solvers import solver_class
 #: SPH: ``benchmarks/sph.py``, a column of water that breaks.
 #: Position-based: BOXBATH as it is (0.7 s a trajectory, 5.5 iterations a substep), dam breaks of 250 to 1000 particles in 2D (10 to 13).
 RATES = {
-    (2, "water"): 10e6, (2, "sand"): 12e6, (2, "goop"): 11e6, (2, "elastic"): 15e6, (2, "snow"): 8.5e6, (2, "rigid"): 10e6,
-    (3, "water"): 15e6, (3, "sand"): 2.7e6, (3, "goop"): 2.7e6, (3, "elastic"): 9e6, (3, "snow"): 2.7e6, (3, "rigid"): 15e6,
-    (2, "pbf"): 0.4e6, (3, "pbf"): 0.8e6,
-    (2, "wcsph"): 7.7e6, (3, "wcsph"): 2.5e6, (2, "dfsph"): 2.2e6, (3, "dfsph"): 1.1e6,
+    (2, "water"): 10e6,
+    (2, "sand"): 12e6,
+    (2, "goop"): 11e6,
+    (2, "elastic"): 15e6,
+    (2, "snow"): 8.5e6,
+    (2, "rigid"): 10e6,
+    (3, "water"): 15e6,
+    (3, "sand"): 2.7e6,
+    (3, "goop"): 2.7e6,
+    (3, "elastic"): 9e6,
+    (3, "snow"): 2.7e6,
+    (3, "rigid"): 15e6,
+    (2, "pbf"): 0.4e6,
+    (3, "pbf"): 0.8e6,
+    (2, "wcsph"): 7.7e6,
+    (3, "wcsph"): 2.5e6,
+    (2, "dfsph"): 2.2e6,
+    (3, "dfsph"): 1.1e6,
 }
 
 #: Scenes drawn to describe a family.
@@ -58,8 +72,14 @@ def plan(family: SceneFamily) -> Plan:
     work = particles * float(substeps.mean()) * (model.frames - 1)
     rate = min(RATES[model.dim, name] for name in plans[0]["rates"])
     return Plan(
-        solver=max(plans, key=lambda each: each["bytes"]), recorded=recorded, particles=particles, substeps=(round(substeps[0]), round(substeps[1])),
-        particle_substeps=work, rate=rate, seconds=work / rate, disk=4.0 * model.frames * recorded * model.dim,
+        solver=max(plans, key=lambda each: each["bytes"]),
+        recorded=recorded,
+        particles=particles,
+        substeps=(round(substeps[0]), round(substeps[1])),
+        particle_substeps=work,
+        rate=rate,
+        seconds=work / rate,
+        disk=4.0 * model.frames * recorded * model.dim,
     )
 
 
@@ -110,8 +130,11 @@ def plan_text(family: SceneFamily, jobs: int = 1) -> str:
         f"scene {model.name}: {solver['title']}, {solver['dim']}D, {', '.join(solver['materials'])}, {solver['walls']} walls",
         f"  particles: {found.recorded:.0f} recorded, {found.particles:.0f} simulated (mean of {_SAMPLES} draws); "
         f"{' x '.join(map(str, solver['cells']))} cells of {solver['grid_spacing']:.4g}",
-        *([f"  obstacles: {solver['obstacles']} in the largest draw, {solver['kinematic']} of its recorded particles are kinematic"]
-          if solver["obstacles"] else []),
+        *(
+            [f"  obstacles: {solver['obstacles']} in the largest draw, {solver['kinematic']} of its recorded particles are kinematic"]
+            if solver["obstacles"]
+            else []
+        ),
         *([f"  context: {solver['context']} numbers a frame"] if solver["context"] else []),
         f"  compiled: {', '.join(solver['kernels'])}",
         f"  allocated: {_size(solver['bytes'])}",

@@ -37,8 +37,13 @@ MARGIN = 0.04  #: free share of a pane on each side of the box
 INK, MUTED, BOX = (34, 34, 34), (110, 110, 110), (178, 178, 178)
 KINEMATIC_GREY = (150, 150, 150)
 TYPE_COLOURS = {
-    "rigid": (176, 84, 48), "boundary": KINEMATIC_GREY, "water": (47, 111, 171), "sand": (201, 162, 94), "goop": (104, 153, 82),
-    "elastic": (146, 92, 160), "snow": (150, 200, 214),
+    "rigid": (176, 84, 48),
+    "boundary": KINEMATIC_GREY,
+    "water": (47, 111, 171),
+    "sand": (201, 162, 94),
+    "goop": (104, 153, 82),
+    "elastic": (146, 92, 160),
+    "snow": (150, 200, 214),
 }
 
 _PROBE = """
@@ -402,8 +407,14 @@ class _Sheet:
 
 
 def _pictures(
-    panes: Sequence[Pane], bounds: np.ndarray, spacing: float, footers: Sequence[str], columns: int | None, width: int,
-    gravity: Sequence[float] | None, oversample: int,
+    panes: Sequence[Pane],
+    bounds: np.ndarray,
+    spacing: float,
+    footers: Sequence[str],
+    columns: int | None,
+    width: int,
+    gravity: Sequence[float] | None,
+    oversample: int,
 ) -> tuple[tuple[int, int], Iterable[np.ndarray]]:
     """(width, height) and the pictures, drawn one by one as they are asked for."""
     view = View(bounds, width, gravity)

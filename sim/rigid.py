@@ -41,11 +41,13 @@ def lift(v):
 def rotation(q):
     """Matrix of a unit quaternion (w, x, y, z)."""
     w, x, y, z = q[0], q[1], q[2], q[3]
-    return ti.Matrix([
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ])
+    return ti.Matrix(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
 
 
 @ti.func
@@ -123,8 +125,12 @@ class Bodies:
                  "inertia": 36, "rest inverse": 36, "moment": 36, "inverse": 36, "faces": 4, "saved centre": 12, "saved velocity": 24,
                  "saved spin": 24, "saved turn": 16}  # fmt: skip
         contact = {"pair": 8, "at": 12, "normal": 16, "impulse": 16}
-        return ({f"rigid {name}": (size, bodies) for name, size in rigid.items()} | {"rigid planes": (16, bodies * planes)}
-                | {"rigid rest": (4 * dim, particles)} | {f"contact {name}": (size, contacts) for name, size in contact.items()})
+        return (
+            {f"rigid {name}": (size, bodies) for name, size in rigid.items()}
+            | {"rigid planes": (16, bodies * planes)}
+            | {"rigid rest": (4 * dim, particles)}
+            | {f"contact {name}": (size, contacts) for name, size in contact.items()}
+        )
 
     # -- what differs between solvers, which override it
     @ti.func

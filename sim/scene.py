@@ -325,7 +325,6 @@ class _Physics(_Strict):
                 raise _mistake(f"context[{index}]", entry, "must be material.key with a number in it, as in sand.friction_angle")
         return self
 
-
     def _check_solver(self) -> None:
         """What the chosen solver cannot do, or needs."""
         method = self.solver.method
@@ -362,7 +361,6 @@ class _Physics(_Strict):
                 raise _mistake(f"materials.{name}.model", "water", f"SPH scenes hold one kind of water, here {waters[0]}; leave one out")
             if method in ("mpm", "wcsph") and isinstance(material, Water) and material.sound_speed is None:
                 raise _mistake(f"materials.{name}.sound_speed", None, f"missing, and {method} needs it: at least ten times the largest speed")
-
 
     def _check_position_based(self) -> None:
         if self.periodic:
@@ -624,8 +622,11 @@ class SceneFamily:
             for value in {end for ranges in spread.values() for ends in ranges for end in ends}:
                 self._validated(_merged(content, {"materials": {name: {key: value}}}))
         folder = Path(str(where)).parent
-        self._meshes = {index: obstacle.read(folder, where, f"obstacles[{index}]")
-                        for index, obstacle in enumerate(self.model.obstacles) if obstacle.kind == "mesh"}
+        self._meshes = {
+            index: obstacle.read(folder, where, f"obstacles[{index}]")
+            for index, obstacle in enumerate(self.model.obstacles)
+            if obstacle.kind == "mesh"
+        }
 
     def _validated(self, content: dict) -> _FamilyModel:
         try:
@@ -759,8 +760,8 @@ def _without_spreads(content: dict, where: object) -> tuple[dict, dict[tuple[str
     """A family's content with one number in place of each varying one, and (material, key) -> split -> ranges."""
     spreads: dict[tuple[str, str], dict[str, list[tuple[float, float]]]] = {}
     materials = content.get("materials")
-    for name, material in (materials.items() if isinstance(materials, dict) else ()):
-        for key, value in (material.items() if isinstance(material, dict) else ()):
+    for name, material in materials.items() if isinstance(materials, dict) else ():
+        for key, value in material.items() if isinstance(material, dict) else ():
             if not isinstance(value, (list, tuple, dict)):
                 continue
             place = f"materials.{name}.{key}"

@@ -62,9 +62,14 @@ def start_from(trajectory: Trajectory, history: int = 6, present: int | None = N
     present = history - 1 if present is None else present
     return Start(
         history=periodic.unwrapped(trajectory.position[max(present + 1 - history, 0) : present + 1], period, -1),
-        particle_type=trajectory.particle_type, present=present,
-        frame_step=trajectory.frame_step, radius=trajectory.radius, bounds=trajectory.bounds, scene=trajectory.scene,
-        context=trajectory.context, kinematic=periodic.unwrapped(trajectory.position[:, kinematic], period, present) if kinematic.any() else None,
+        particle_type=trajectory.particle_type,
+        present=present,
+        frame_step=trajectory.frame_step,
+        radius=trajectory.radius,
+        bounds=trajectory.bounds,
+        scene=trajectory.scene,
+        context=trajectory.context,
+        kinematic=periodic.unwrapped(trajectory.position[:, kinematic], period, present) if kinematic.any() else None,
     )
 
 

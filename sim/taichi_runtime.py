@@ -47,8 +47,14 @@ def start_taichi(arch: str | None = None) -> str:
         # It prints the architecture whatever the log level.
         with contextlib.redirect_stdout(io.StringIO()):
             ti.init(
-                arch=getattr(ti, arch), default_fp=ti.f32, fast_math=True, cpu_max_num_threads=1, log_level=ti.ERROR,
-                offline_cache=True, offline_cache_file_path=str(cache), random_seed=0,
+                arch=getattr(ti, arch),
+                default_fp=ti.f32,
+                fast_math=True,
+                cpu_max_num_threads=1,
+                log_level=ti.ERROR,
+                offline_cache=True,
+                offline_cache_file_path=str(cache),
+                random_seed=0,
                 # Its analysis of loads and stores took half of the compile time (3D water 6.3 s, without it 3.2 s); LLVM does the same.
                 cfg_optimization=False,
                 # Each further thread first loads Taichi's runtime, 0.2 s, and a frame is one kernel.

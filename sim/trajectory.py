@@ -403,7 +403,15 @@ class ShardReader:
         """The whole trajectory."""
         meta = self.meta(index)
         return Trajectory(
-            position=self.positions(index), particle_type=self.particle_type(index), frame_step=float(meta["frame_step"]),
-            radius=float(meta["radius"]), bounds=np.asarray(meta["bounds"], float), scene=meta["scene"], seed=meta["seed"],
-            simulator=meta["simulator"], status=meta["status"], context=self.context(index), diagnostics=self.diagnostics(index),
+            position=self.positions(index),
+            particle_type=self.particle_type(index),
+            frame_step=float(meta["frame_step"]),
+            radius=float(meta["radius"]),
+            bounds=np.asarray(meta["bounds"], float),
+            scene=meta["scene"],
+            seed=meta["seed"],
+            simulator=meta["simulator"],
+            status=meta["status"],
+            context=self.context(index),
+            diagnostics=self.diagnostics(index),
         )

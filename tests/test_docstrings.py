@@ -54,7 +54,8 @@ def test_methods_say_what_they_do_or_keep_a_contract():
     known = contract()
     assert {"begin", "advance", "load", "frame", "loss", "kirchhoff", "wave_speed"} <= known
     missing = [
-        where for where, path, kind, node in everything()
+        where
+        for where, path, kind, node in everything()
         if kind is not None and node.name not in {"__init__", *known} and not ast.get_docstring(node) and not inherited(path, kind, node.name)
     ]
     assert not missing, "\n".join(missing)

@@ -60,4 +60,3 @@ def settings(study: Study, comparison: str, trajectories: list[Trajectory]) -> C
     """What the comparison holds fixed."""
     refined = trajectories[0].scene.get("refine", 1) > 1
     return CompareSettings(reference="fine teacher" if refined else "teacher", horizons=tuple(study.comparisons[comparison]["horizons"]))
-

@@ -36,7 +36,9 @@ def _cost(study: Study, model: str) -> dict | None:
     return {
         "generation_seconds": sum(sum(splits[split]["cost"].values()) for split in PARTS["learning"] if split in splits),
         "training_seconds": float(np.mean([run["seconds"] for run in runs])),
-        "trajectories": splits["train"]["ok"], "parameters": runs[0]["parameters"], "steps": int(np.mean([run["steps"] for run in runs])),
+        "trajectories": splits["train"]["ok"],
+        "parameters": runs[0]["parameters"],
+        "steps": int(np.mean([run["steps"] for run in runs])),
         "device": runs[0]["device"],
     }
 
@@ -99,9 +101,9 @@ def jobs(study: Study) -> list[dict]:
     result = []
     for rule, lines in found.items():
         seconds, memory = [float(line["s"]) for line in lines], [float(line["max_rss"]) for line in lines if line["max_rss"] not in ("-", "NA")]
-        result.append({
-            "rule": rule, "jobs": len(lines), "seconds": sum(seconds), "longest_seconds": max(seconds), "memory_mb": max(memory, default=None),
-        })
+        result.append(
+            {"rule": rule, "jobs": len(lines), "seconds": sum(seconds), "longest_seconds": max(seconds), "memory_mb": max(memory, default=None)}
+        )
     return sorted(result, key=lambda job: -job["seconds"])
 
 
@@ -122,8 +124,14 @@ def summarise(study: Study) -> dict:
         # Each comparison is timed on one machine, but a cluster may give another one to the next.
         provenance["timed on"] = machines
     return {
-        "title": study.content["title"], "rows": rows, "hardware": hardware, "versions": versions, "analysis": analyse(rows),
-        "verdict": verdict(rows, targets), "jobs": jobs(study), "provenance": provenance,
+        "title": study.content["title"],
+        "rows": rows,
+        "hardware": hardware,
+        "versions": versions,
+        "analysis": analyse(rows),
+        "verdict": verdict(rows, targets),
+        "jobs": jobs(study),
+        "provenance": provenance,
     }
 
 
@@ -161,7 +169,8 @@ def assets(study: Study, summary: dict) -> dict[str, SceneAssets]:
         count = next(row["trajectories"] for row in summary["rows"] if row["scene"] == scene)
         films = [
             Asset(
-                picture(f"{model}.mp4"), poster=picture(f"{model}.png"),
+                picture(f"{model}.mp4"),
+                poster=picture(f"{model}.png"),
                 caption=f"Teacher, {model}, and their distance; of {count} test trajectories the one of {entry['films'][0]}'s median error.",
             )
             for model in entry["films"]

@@ -813,9 +813,20 @@ class MPMSimulator:
     refuses or shortens, to see where the solver really becomes unstable. Raises ``InputError`` for overrides that cannot go together.
     """
 
-    def __init__(self, *, name: str = "mpm", kind: Kind = "reference", cfl: float | None = None, stiffness: float = 1.0, coarsen: float = 1.0,
-                 particles: str | int = "teacher", perturbation: float = 0.0, frames: int = 1, serial: bool | None = None,
-                 unguarded_step: float | None = None):
+    def __init__(
+        self,
+        *,
+        name: str = "mpm",
+        kind: Kind = "reference",
+        cfl: float | None = None,
+        stiffness: float = 1.0,
+        coarsen: float = 1.0,
+        particles: str | int = "teacher",
+        perturbation: float = 0.0,
+        frames: int = 1,
+        serial: bool | None = None,
+        unguarded_step: float | None = None,
+    ):
         check_particles(name, particles)
         if frames < 1:
             raise InputError(name, "frames", frames, "must be at least 1")
@@ -823,7 +834,12 @@ class MPMSimulator:
             raise InputError(name, "coarsen", coarsen, "a coarser grid needs particles: recorded")
         self.name, self.kind = name, kind
         self.settings: dict[str, Any] = {
-            "cfl": cfl, "stiffness": stiffness, "coarsen": coarsen, "particles": particles, "perturbation": perturbation, "frames": frames,
+            "cfl": cfl,
+            "stiffness": stiffness,
+            "coarsen": coarsen,
+            "particles": particles,
+            "perturbation": perturbation,
+            "frames": frames,
         }
         self.serial, self.unguarded_step = serial, unguarded_step
         self.compile_seconds = 0.0
@@ -1027,28 +1043,52 @@ class MPMSimulator:
         if structure.obstacles != "none":
             fields["signed distance"] = (4 * (dim + 2), nodes)
             columns = _power_of_two(len(self._columns(scene, tuple(int(c) + 2 * WALL + 1 for c in cells))))
-            fields |= {"obstacle foot": (4 * (2 * dim + 1), columns), "obstacle face": (4 * (dim + 2), columns),
-                       "obstacle impulse": (4 * (dim + 2), columns)}
+            fields |= {
+                "obstacle foot": (4 * (2 * dim + 1), columns),
+                "obstacle face": (4 * (dim + 2), columns),
+                "obstacle impulse": (4 * (dim + 2), columns),
+            }
             kernels.append("load_solids")
         if structure.rigid is None:
             left_out["rigid bodies"] = "none in the scene"
         else:
             fields |= RigidBodies.sizes(dim, *structure.rigid, n, nodes)
             kernels.remove("frame_serial")
-            kernels += ["save", "spread_serial", "meet_rigid", "solve_rigid", "move_rigid", "collect_serial", "report_parallel", "load_rigid",
-                        "keep_rigid"]
+            kernels += [
+                "save",
+                "spread_serial",
+                "meet_rigid",
+                "solve_rigid",
+                "move_rigid",
+                "collect_serial",
+                "report_parallel",
+                "load_rigid",
+                "keep_rigid",
+            ]
         gravity = float(np.linalg.norm(np.array(scene.gravity) - scene.acceleration(), axis=1).max())
         start = float(np.sqrt((particles.velocity**2).sum(1).max()))
         fall = float(np.sqrt(start**2 + 2 * gravity * np.linalg.norm(upper - lower)))
         wave_speed, _ = self._at_start(scene, 0.0)
         substeps = [self._substeps(scene, dx, wave_speed, v + gravity * scene.frame_step) for v in (0.0, fall)]
         return {
-            "title": "MLS-MPM", "dim": dim, "materials": [name for name, *_ in models], "rates": [name for name, *_ in models], "walls": friction,
+            "title": "MLS-MPM",
+            "dim": dim,
+            "materials": [name for name, *_ in models],
+            "rates": [name for name, *_ in models],
+            "walls": friction,
             "obstacles": len(scene.obstacles),
-            "context": 0 if context is None else context.shape[1], "kernels": kernels, "fields": fields, "left_out": left_out,
-            "bytes": sum(size * count for size, count in fields.values()), "particles": len(particles.position),
-            "recorded": len(particles.tracked) + len(scene.boundary), "kinematic": len(scene.boundary), "cells": cells.tolist(),
-            "grid_spacing": dx, "wave_speed": wave_speed, "substeps_per_frame": substeps,
+            "context": 0 if context is None else context.shape[1],
+            "kernels": kernels,
+            "fields": fields,
+            "left_out": left_out,
+            "bytes": sum(size * count for size, count in fields.values()),
+            "particles": len(particles.position),
+            "recorded": len(particles.tracked) + len(scene.boundary),
+            "kinematic": len(scene.boundary),
+            "cells": cells.tolist(),
+            "grid_spacing": dx,
+            "wave_speed": wave_speed,
+            "substeps_per_frame": substeps,
         }
 
     def _run(self, substeps: int, dt: float, keep: bool, frames: int = 1) -> np.ndarray:
@@ -1060,8 +1100,13 @@ class MPMSimulator:
         self._kernels.frame(frames, substeps, dt, int(keep), self._position, sums)
         kinetic, potential, elastic, speed, wave_speed = sums[-1, :5].tolist()
         self._diagnostics = {
-            "kinetic_energy": kinetic, "potential_energy": potential, "elastic_energy": elastic, "max_speed": float(np.sqrt(speed)),
-            "wave_speed": wave_speed, "substeps": float(substeps), "dt": dt,
+            "kinetic_energy": kinetic,
+            "potential_energy": potential,
+            "elastic_energy": elastic,
+            "max_speed": float(np.sqrt(speed)),
+            "wave_speed": wave_speed,
+            "substeps": float(substeps),
+            "dt": dt,
         }
         return sums
 

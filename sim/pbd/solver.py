@@ -495,8 +495,16 @@ class PBDSimulator:
     ``perturbation`` (length: random displacement of the start, for the chaos floor). Raises ``InputError`` for ones that cannot be.
     """
 
-    def __init__(self, *, name: str = "pbd", kind: Kind = "reference", cfl: float | None = None, particles: str | int = "teacher",
-                 tolerance: float = 1.0, perturbation: float = 0.0):
+    def __init__(
+        self,
+        *,
+        name: str = "pbd",
+        kind: Kind = "reference",
+        cfl: float | None = None,
+        particles: str | int = "teacher",
+        tolerance: float = 1.0,
+        perturbation: float = 0.0,
+    ):
         check_particles(name, particles)
         self.name, self.kind = name, kind
         self.settings: dict[str, Any] = {"cfl": cfl, "particles": particles, "tolerance": tolerance, "perturbation": perturbation}
@@ -567,8 +575,10 @@ class PBDSimulator:
         what = min(limits, key=limits.__getitem__)
         if step is not None and step > limits[what] * (1 + 1e-6):
             steps = int(np.ceil(scene.frame_step / limits[what]))
-            remedy = (f"above the limit {limits[what]:.4g} s, which {what} sets (cfl {scene.cfl:g}, speed {speed:.3g} m/s); use at most "
-                      f"{scene.frame_step / steps:.8g}, {steps} steps a frame, or leave it out: adaptive")
+            remedy = (
+                f"above the limit {limits[what]:.4g} s, which {what} sets (cfl {scene.cfl:g}, speed {speed:.3g} m/s); use at most "
+                f"{scene.frame_step / steps:.8g}, {steps} steps a frame, or leave it out: adaptive"
+            )
             raise InputError(where, "time_step", scene.time_step, remedy)
 
     def plan(self, scene: Scene) -> dict:
@@ -659,9 +669,15 @@ class PBDSimulator:
         self._kernels.frame(steps, self._position, report)
         joule = self._mass * self._support**2
         self._diagnostics = {
-            "kinetic_energy": report[k.KINETIC] * joule, "potential_energy": report[k.POTENTIAL] * joule,
-            "max_speed": report[k.SPEED] * self._support, "substeps": report[k.STEPS], "dt": report[k.STEP], "density": report[k.DENSEST],
-            "iterations": report[k.SOLVED], "density_error": report[k.ERROR], "unsolved": report[k.UNSOLVED],
+            "kinetic_energy": report[k.KINETIC] * joule,
+            "potential_energy": report[k.POTENTIAL] * joule,
+            "max_speed": report[k.SPEED] * self._support,
+            "substeps": report[k.STEPS],
+            "dt": report[k.STEP],
+            "density": report[k.DENSEST],
+            "iterations": report[k.SOLVED],
+            "density_error": report[k.ERROR],
+            "unsolved": report[k.UNSOLVED],
         }
         return report
 

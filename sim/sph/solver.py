@@ -95,12 +95,50 @@ class _Kernels(Walls):
     """Fields and compiled code for one ``Structure``."""
 
     #: Places in ``number``.
-    (COUNT, VOLUME, KERNEL, SPACING, CFL, SOUND, GAMMA, VISCOSITY, ALPHA, DELTA, DENSITY_ERROR, DIVERGENCE_ERROR, ITERATIONS, THICKNESS, XSPH,
-     ROUGH, LIGHT, CORNER, SHIFT, NUMBERS) = range(20)
+    (
+        COUNT,
+        VOLUME,
+        KERNEL,
+        SPACING,
+        CFL,
+        SOUND,
+        GAMMA,
+        VISCOSITY,
+        ALPHA,
+        DELTA,
+        DENSITY_ERROR,
+        DIVERGENCE_ERROR,
+        ITERATIONS,
+        THICKNESS,
+        XSPH,
+        ROUGH,
+        LIGHT,
+        CORNER,
+        SHIFT,
+        NUMBERS,
+    ) = range(20)
     #: Places in a frame's report. Read from it are gravity, its change since the frame before, the frame's length, the longest step and whether
     #: all are to be so long, and the limit below which the frame ends.
-    (STEPS, STEP, SPEED, SOLVED, ERROR, UNSOLVED, KINETIC, POTENTIAL, ELASTIC, DENSEST, BROKEN, FULL, LISTED, THICKENED, VISCOUS, OUTSIDE, LAST,
-     LIMIT) = (0, 1, 2, 3, 5, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16, 17, 18, 19)
+    (
+        STEPS,
+        STEP,
+        SPEED,
+        SOLVED,
+        ERROR,
+        UNSOLVED,
+        KINETIC,
+        POTENTIAL,
+        ELASTIC,
+        DENSEST,
+        BROKEN,
+        FULL,
+        LISTED,
+        THICKENED,
+        VISCOUS,
+        OUTSIDE,
+        LAST,
+        LIMIT,
+    ) = (0, 1, 2, 3, 5, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16, 17, 18, 19)
     GRAVITY, CHANGE, SPAN, CAP, FIXED, FLOOR, REPORT = 20, 23, 26, 27, 28, 29, 30
 
     def __init__(self, structure: Structure, capacity: int, cells: int, pairs: int, wet: int, nodes: tuple[int, ...]):
@@ -396,12 +434,26 @@ class SPHSimulator:
     Raises ``InputError`` for overrides that cannot be.
     """
 
-    def __init__(self, *, name: str = "sph", kind: Kind = "reference", cfl: float | None = None, particles: str | int = "teacher",
-                 tolerance: float = 1.0, stiffness: float = 1.0, perturbation: float = 0.0, unguarded_step: float | None = None):
+    def __init__(
+        self,
+        *,
+        name: str = "sph",
+        kind: Kind = "reference",
+        cfl: float | None = None,
+        particles: str | int = "teacher",
+        tolerance: float = 1.0,
+        stiffness: float = 1.0,
+        perturbation: float = 0.0,
+        unguarded_step: float | None = None,
+    ):
         check_particles(name, particles)
         self.name, self.kind = name, kind
         self.settings: dict[str, Any] = {
-            "cfl": cfl, "particles": particles, "tolerance": tolerance, "stiffness": stiffness, "perturbation": perturbation,
+            "cfl": cfl,
+            "particles": particles,
+            "tolerance": tolerance,
+            "stiffness": stiffness,
+            "perturbation": perturbation,
         }
         self.unguarded_step = unguarded_step
         self.compile_seconds = 0.0
@@ -541,8 +593,10 @@ class SPHSimulator:
         what = min(limits, key=limits.__getitem__)
         if scene.time_step > limits[what] * (1 + 1e-6):
             steps = int(np.ceil(scene.frame_step / limits[what]))
-            remedy = (f"above the limit {limits[what]:.4g} s, which {what} sets (cfl {scene.cfl:g}, speed {speed:.3g} m/s); use at most "
-                      f"{scene.frame_step / steps:.8g}, {steps} steps a frame, or leave it out: adaptive")
+            remedy = (
+                f"above the limit {limits[what]:.4g} s, which {what} sets (cfl {scene.cfl:g}, speed {speed:.3g} m/s); use at most "
+                f"{scene.frame_step / steps:.8g}, {steps} steps a frame, or leave it out: adaptive"
+            )
             raise InputError(where, "time_step", scene.time_step, remedy)
 
     def plan(self, scene: Scene) -> dict:
@@ -556,8 +610,17 @@ class SPHSimulator:
         state |= {"density rate before": 4} if method == "wcsph" and not structure.shifting else {}
         fields = {name: (size, n) for name, size in state.items()} | {f"moved {name}": (size, n) for name, size in state.items()}
         fields |= {f"saved {name}": (size, n) for name, size in state.items()} | {f"{name}id": (4, n) for name in ("", "moved ", "saved ")}
-        fields |= {"cell": (4, n), "sorted place": (4, n), "first pair": (4, n + 1), "place when listed": (16, n), "pairs": (4, pairs),
-                   "cell starts": (4, boxes + 2), "cell cursors": (4, boxes + 2), "numbers": (4, _Kernels.NUMBERS), "wall table": (28, ENTRIES + 2)}
+        fields |= {
+            "cell": (4, n),
+            "sorted place": (4, n),
+            "first pair": (4, n + 1),
+            "place when listed": (16, n),
+            "pairs": (4, pairs),
+            "cell starts": (4, boxes + 2),
+            "cell cursors": (4, boxes + 2),
+            "numbers": (4, _Kernels.NUMBERS),
+            "wall table": (28, ENTRIES + 2),
+        }
         if method == "dfsph":
             fields |= {"pairs within reach": (4, pairs), "gradients": (16, pairs), "first within reach": (4, n + 1)}
             fields |= {name: (16, n) for name in ("sums", "wall", "crowd", "stretch", "push", "move")} | {"alpha": (8, n)}
@@ -570,7 +633,8 @@ class SPHSimulator:
         fields |= RigidBodies.fields(dim, *structure.rigid, n, wet, method == "wcsph", structure.viscous) if structure.rigid else {}
         context = scene.context_values()
         reasons = {
-            "third dimension": "a 2D scene" if dim == 2 else None, "viscosity": None if structure.viscous else "inviscid water",
+            "third dimension": "a 2D scene" if dim == 2 else None,
+            "viscosity": None if structure.viscous else "inviscid water",
             "wall friction": None if structure.no_slip else "inviscid water" if scene.walls.friction == "sticky" else "slip walls",
             "signed distance": None if structure.obstacles else "no obstacles",
             "rigid bodies": None if structure.rigid else "none in the scene",
@@ -586,15 +650,23 @@ class SPHSimulator:
         start = float(np.sqrt((particles.velocity**2).sum(1).max()))
         fall = float(np.sqrt(start**2 + 2 * gravity * np.linalg.norm(np.ptp(scene.bounds, axis=1))))
         return {
-            "title": {"wcsph": "weakly compressible SPH", "dfsph": "divergence-free SPH"}[method], "dim": dim, "rates": [method],
+            "title": {"wcsph": "weakly compressible SPH", "dfsph": "divergence-free SPH"}[method],
+            "dim": dim,
+            "rates": [method],
             "materials": [material.model for material in scene.materials.values()],
             "walls": "sticky" if structure.no_slip else "slip",
-            "obstacles": len(scene.obstacles), "context": 0 if context is None else context.shape[1],
+            "obstacles": len(scene.obstacles),
+            "context": 0 if context is None else context.shape[1],
             "kernels": ["load", "frame", "restore"] + ["load_solids"] * structure.obstacles,
             "fields": fields,
-            "left_out": {what: why for what, why in reasons.items() if why}, "bytes": sum(size * count for size, count in fields.values()),
-            "particles": len(particles.position), "recorded": len(particles.tracked) + len(scene.boundary), "kinematic": len(scene.boundary),
-            "cells": cells.tolist(), "grid_spacing": support * (1 + SKIN), "wave_speed": _sound(self._water(scene)) if method == "wcsph" else 0.0,
+            "left_out": {what: why for what, why in reasons.items() if why},
+            "bytes": sum(size * count for size, count in fields.values()),
+            "particles": len(particles.position),
+            "recorded": len(particles.tracked) + len(scene.boundary),
+            "kinematic": len(scene.boundary),
+            "cells": cells.tolist(),
+            "grid_spacing": support * (1 + SKIN),
+            "wave_speed": _sound(self._water(scene)) if method == "wcsph" else 0.0,
             "substeps_per_frame": [self._substeps(scene, speed + gravity * scene.frame_step) for speed in (0.0, fall)],
         }
 
@@ -675,15 +747,22 @@ class SPHSimulator:
         self._kernels.frame(int(keep), self._position, report)
         joule = self._mass * self._support**2
         self._diagnostics = {
-            "kinetic_energy": report[k.KINETIC] * joule, "potential_energy": report[k.POTENTIAL] * joule,
-            "max_speed": report[k.SPEED] * self._support, "substeps": report[k.STEPS], "dt": report[k.STEP], "density": report[k.DENSEST],
+            "kinetic_energy": report[k.KINETIC] * joule,
+            "potential_energy": report[k.POTENTIAL] * joule,
+            "max_speed": report[k.SPEED] * self._support,
+            "substeps": report[k.STEPS],
+            "dt": report[k.STEP],
+            "density": report[k.DENSEST],
         }
         if scene.solver.method == "wcsph":
             self._diagnostics["elastic_energy"] = report[k.ELASTIC] * joule
         else:
             self._diagnostics |= {
-                "iterations_divergence": report[k.SOLVED], "iterations_density": report[k.SOLVED + 1], "divergence_error": report[k.ERROR],
-                "density_error": report[k.ERROR + 1], "unsolved": report[k.UNSOLVED],
+                "iterations_divergence": report[k.SOLVED],
+                "iterations_density": report[k.SOLVED + 1],
+                "divergence_error": report[k.ERROR],
+                "density_error": report[k.ERROR + 1],
+                "unsolved": report[k.UNSOLVED],
             }
             if self._kernels.structure.viscous:
                 self._diagnostics["iterations_viscosity"] = report[k.THICKENED]

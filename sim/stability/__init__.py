@@ -13,8 +13,28 @@ from dataclasses import dataclass, field
 import numpy as np
 
 CASES = (
-    "young_dt", "speed_dt", "sound_dt", "viscosity_dt", "fall_dt", "refusal", "courant", "stiff", "poisson", "density_ratio", "impact",
-    "few_particles", "contact", "seeding", "rest", "friction_angle", "inverted", "unsolved", "runaway", "shaking", "not_a_number", "resume",
+    "young_dt",
+    "speed_dt",
+    "sound_dt",
+    "viscosity_dt",
+    "fall_dt",
+    "refusal",
+    "courant",
+    "stiff",
+    "poisson",
+    "density_ratio",
+    "impact",
+    "few_particles",
+    "contact",
+    "seeding",
+    "rest",
+    "friction_angle",
+    "inverted",
+    "unsolved",
+    "runaway",
+    "shaking",
+    "not_a_number",
+    "resume",
 )
 #: Energy that counts as bounded, over the start's. Symplectic Euler swings about the true energy by up to 1 / (1 - (w dt / 2)^2); the fastest
 #: oscillation of the grid, w = 2 sqrt(2) c / dx in 2D, makes that 1.47 at the default Courant number of 0.4. An instability knows no bound.

@@ -22,8 +22,12 @@ EXPECTED = "bounded energy, or failed and said so"
 
 def run() -> list[Cell]:
     """Dropped from two cells above a rough floor, in 2D and 3D; energy at hand is what a fall to the floor would release."""
-    return [_drop(name, material, courant, dim) for dim, numbers in ((2, COURANT), (3, COURANT_3D))
-            for name, material in (MATERIALS | SPH | PBF).items() for courant in numbers]
+    return [
+        _drop(name, material, courant, dim)
+        for dim, numbers in ((2, COURANT), (3, COURANT_3D))
+        for name, material in (MATERIALS | SPH | PBF).items()
+        for courant in numbers
+    ]
 
 
 def _drop(name: str, material: dict, courant: float, dim: int) -> Cell:
@@ -39,6 +43,10 @@ def _drop(name: str, material: dict, courant: float, dim: int) -> Cell:
     right = growth <= BOUND - 1 or not run.ok
     observed = f"energy at most {1 + growth:.3g} of the start's" if run.ok else run.status
     numbers: dict[str, float | str | None] = {
-        "dim": dim, "courant": courant, "energy_growth": growth, "smallest_dt": float(run.dt.min(initial=1.0)), "status": run.status,
+        "dim": dim,
+        "courant": courant,
+        "energy_growth": growth,
+        "smallest_dt": float(run.dt.min(initial=1.0)),
+        "status": run.status,
     }
     return Cell("courant", cell, right, EXPECTED, observed, numbers, time.perf_counter() - begun, {cell: run.energy_curve(scale)})

@@ -32,13 +32,17 @@ def deep(what: Scene, low: float, high: float) -> Scene:
     for body in content["bodies"]:
         body["lower"], body["upper"], body["velocity"] = [*body["lower"], low], [*body["upper"], high], [*body["velocity"], 0.0]
     solids = [
-        {"kind": "box", "lower": [0.0, solid["start"][1] - solid["thickness"] / 2, 0.0],
-         "upper": [1.0, solid["end"][1] + solid["thickness"] / 2, 1.0]}
+        {
+            "kind": "box",
+            "lower": [0.0, solid["start"][1] - solid["thickness"] / 2, 0.0],
+            "upper": [1.0, solid["end"][1] + solid["thickness"] / 2, 1.0],
+        }
         for solid in content.get("obstacles", [])
     ]
     bounds, cells = content["bounds"], content["cells"]
-    return Scene.from_dict(content | {"dim": 3, "bounds": [*bounds, bounds[0]], "cells": [*cells, cells[0]],
-                                      "gravity": [*content["gravity"], 0.0], "obstacles": solids})
+    return Scene.from_dict(
+        content | {"dim": 3, "bounds": [*bounds, bounds[0]], "cells": [*cells, cells[0]], "gravity": [*content["gravity"], 0.0], "obstacles": solids}
+    )
 
 
 @dataclass(frozen=True)
@@ -104,8 +108,14 @@ def follow(what: Scene, frames: int, prepare=None, observe=None) -> Run:
     column = {name: np.array([row[name] for row in rows]) for name in rows[0]}
     energy = column["kinetic_energy"] + column["potential_energy"] + column.get("elastic_energy", 0.0)
     return Run(
-        time=what.frame_step * np.arange(1, len(rows)), kinetic=column["kinetic_energy"][1:], energy=energy, speed=column["max_speed"][1:],
-        substeps=column["substeps"][1:], dt=column["dt"][1:], position=position, status=status,
+        time=what.frame_step * np.arange(1, len(rows)),
+        kinetic=column["kinetic_energy"][1:],
+        energy=energy,
+        speed=column["max_speed"][1:],
+        substeps=column["substeps"][1:],
+        dt=column["dt"][1:],
+        position=position,
+        status=status,
     )
 
 

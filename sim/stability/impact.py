@@ -26,18 +26,28 @@ TARGETS = {"floor": [], "plate": [PLATE]}
 def run() -> list[Cell]:
     """Each material thrown at the floor, and at a plate two cells thick, in 2D and 3D; and one that may not bear it. PBF has no plates."""
     materials, fast = MATERIALS | SPH | PBF, SPH["wcsph"] | {"sound_speed": 10 * SPEED}
-    return [_thrown(name, materials[name], target, dim) for dim in (2, 3) for name in materials for target in TARGETS
-            if name not in PBF or target == "floor"] + [
-        # Sound as fast as weakly compressible water should have it.
-        _thrown("wcsph", fast, target, dim, ", sound ten times as fast,") for dim in (2, 3) for target in TARGETS] + [
-        _thrown("elastic", SOFT, "plate", 2, ", far too soft,", may_fail=True)]
+    return (
+        [
+            _thrown(name, materials[name], target, dim)
+            for dim in (2, 3)
+            for name in materials
+            for target in TARGETS
+            if name not in PBF or target == "floor"
+        ]
+        + [
+            # Sound as fast as weakly compressible water should have it.
+            _thrown("wcsph", fast, target, dim, ", sound ten times as fast,")
+            for dim in (2, 3)
+            for target in TARGETS
+        ]
+        + [_thrown("elastic", SOFT, "plate", 2, ", far too soft,", may_fail=True)]
+    )
 
 
 def _thrown(name: str, material: dict, target: str, dim: int, more: str = "", may_fail: bool = False) -> Cell:
     begun, cell = time.perf_counter(), f"{name}{more} on a {target}{', 3D' if dim == 3 else ''}"
     body = {"kind": "box", "lower": [0.375, 0.5], "upper": [0.625, 0.75], "velocity": [0.0, -SPEED]}
-    what = scene("impact", material, [body], [[0.0, 1.0]] * 2, [CELLS] * 2, 5e-4, gravity=[0.0, -G],
-                 obstacles=TARGETS[target], **way(name))
+    what = scene("impact", material, [body], [[0.0, 1.0]] * 2, [CELLS] * 2, 5e-4, gravity=[0.0, -G], obstacles=TARGETS[target], **way(name))
     if dim == 3:
         what = deep(what, 0.375, 0.625)
     run = follow(what, 60)

@@ -16,8 +16,15 @@ from sim.stability.command_line import command
 EXPECTED = "exit code 2, one line with file, key, value, the limit and what sets it, nothing written; accepted at the limit"
 FRAME, CELLS = 0.01, 16
 FAMILY: dict = {
-    "name": "refusal", "dim": 2, "bounds": [[0.0, 1.0], [0.0, 1.0]], "gravity": [0.0, 0.0], "frame_step": FRAME, "frames": 3, "radius": 0.1,
-    "cells": [CELLS, CELLS], "bodies": [{"material": "stuff", "shape": {"kind": "box", "size": [0.25, 0.25]}}],
+    "name": "refusal",
+    "dim": 2,
+    "bounds": [[0.0, 1.0], [0.0, 1.0]],
+    "gravity": [0.0, 0.0],
+    "frame_step": FRAME,
+    "frames": 3,
+    "radius": 0.1,
+    "cells": [CELLS, CELLS],
+    "bodies": [{"material": "stuff", "shape": {"kind": "box", "size": [0.25, 0.25]}}],
     "splits": {"train": 2, "valid": 0, "test": 0},
 }
 #: Half the support radius of WCSPH, 1.25 spacings.

@@ -46,8 +46,14 @@ def row(cell: Cell) -> dict:
         chosen = np.unique(np.linspace(0, len(series.x) - 1, _POINTS).astype(int))
         curves[name] = {"axes": list(series.axes), **{key: [_plain(each) for each in getattr(series, key)[chosen]] for key in ("x", "y")}}
     return {
-        "case": cell.case, "cell": cell.cell, "right": bool(cell.right), "expected": cell.expected, "observed": cell.observed,
-        "numbers": {key: _plain(value) for key, value in cell.numbers.items()}, "seconds": cell.seconds, "curves": curves,
+        "case": cell.case,
+        "cell": cell.cell,
+        "right": bool(cell.right),
+        "expected": cell.expected,
+        "observed": cell.observed,
+        "numbers": {key: _plain(value) for key, value in cell.numbers.items()},
+        "seconds": cell.seconds,
+        "curves": curves,
     }
 
 
@@ -169,7 +175,11 @@ def write_report(summary: Mapping, path: str | Path) -> None:
         sections.append({"case": case, "title": title(case), "rows": listed, "pictures": pictures, "cells": len(rows), "wrong": wrong,
                          "seconds": sum(one["seconds"] for one in rows)})  # fmt: skip
     page = render(
-        Path(__file__).parent / "report_template.html", title=summary["title"], verdict=summary["verdict"], sections=sections, shown=_shown,
+        Path(__file__).parent / "report_template.html",
+        title=summary["title"],
+        verdict=summary["verdict"],
+        sections=sections,
+        shown=_shown,
         provenance={name: summary[name] for name in ("hardware", "versions")} | {"how to repeat": summary["provenance"]},
     )
     with atomic_path(path) as temporary:

@@ -21,7 +21,9 @@ from sim.stability.refusal import FAMILY
 TRAJECTORIES, DEADLINE = 6, 1500.0
 #: Two bodies of water fall on a ball.
 AMONG = {
-    "frames": 200, "gravity": [0.0, -9.8], "obstacles": [{"kind": "ball", "radius": 0.15, "count": [1, 1], "center": [[0.4, 0.6], 0.15]}],
+    "frames": 200,
+    "gravity": [0.0, -9.8],
+    "obstacles": [{"kind": "ball", "radius": 0.15, "count": [1, 1], "center": [[0.4, 0.6], 0.15]}],
     "bodies": [{"material": "stuff", "shape": {"kind": "box", "size": [0.25, 0.25]}, "velocity": [[-1.0, 1.0], [-1.0, 0.0]], "count": [2, 2]}],
 }
 FAMILIES = {"": FAMILY | {"materials": {"stuff": MATERIALS["water"]}, "frames": 400, "gravity": [0.0, -9.8]}}

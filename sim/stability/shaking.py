@@ -12,7 +12,9 @@ from sim.validation import scene
 CELLS, G, FRAME, SHAKE = 16, 9.8, 0.002, 98.0
 #: Five times the speed that the shaken box gives.
 WATER: dict[str, dict] = {
-    "water": {"model": "water", "sound_speed": 20.0}, "wcsph": SPH["wcsph"] | {"sound_speed": 80.0}, "dfsph": SPH["dfsph"],
+    "water": {"model": "water", "sound_speed": 20.0},
+    "wcsph": SPH["wcsph"] | {"sound_speed": 80.0},
+    "dfsph": SPH["dfsph"],
 } | PBF
 #: Of positions in float32, as 33 cells in a random walk of some hundred steps round them.
 ROUNDING = 1e-4

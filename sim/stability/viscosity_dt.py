@@ -1,7 +1,5 @@
 """Viscosity against time step (WCSPH): a block in a sticky corner that noise stirs, at fixed steps of 1 / 100 to 1 h^2 / nu."""
 
-
-
 from sim.stability import Cell
 from sim.stability.driver import noise
 from sim.stability.maps import STEPS_A_FRAME, adaptive_cell, map_cell

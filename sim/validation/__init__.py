@@ -15,9 +15,26 @@ from scipy.optimize import curve_fit
 from sim.scene import Scene
 
 CASES = (
-    "rotation", "return_map", "hydrostatics", "elastic_column", "axial_bar", "cantilever", "taylor_green", "channel", "lid_driven_cavity",
-    "standing_wave", "elliptical_drop", "dam_break", "dam_impact", "sloshing", "granular_collapse", "block_on_plane", "rotating_patch",
-    "elastic_discs", "float_and_sink", "viscoplastic_slump",
+    "rotation",
+    "return_map",
+    "hydrostatics",
+    "elastic_column",
+    "axial_bar",
+    "cantilever",
+    "taylor_green",
+    "channel",
+    "lid_driven_cavity",
+    "standing_wave",
+    "elliptical_drop",
+    "dam_break",
+    "dam_impact",
+    "sloshing",
+    "granular_collapse",
+    "block_on_plane",
+    "rotating_patch",
+    "elastic_discs",
+    "float_and_sink",
+    "viscoplastic_slump",
 )
 
 
@@ -59,8 +76,17 @@ def scene(name: str, material: dict, bodies: list[dict], bounds: list, cells: li
     still = [0.0] * len(bounds)
     bodies = [{"material": "stuff", "velocity": still} | body for body in bodies]
     content = {
-        "name": name, "dim": len(bounds), "bounds": bounds, "gravity": still, "frame_step": frame_step, "frames": 2, "cells": cells,
-        "radius": (bounds[0][1] - bounds[0][0]) / cells[0], "materials": {"stuff": material}, "seed": 0, "bodies": bodies,
+        "name": name,
+        "dim": len(bounds),
+        "bounds": bounds,
+        "gravity": still,
+        "frame_step": frame_step,
+        "frames": 2,
+        "cells": cells,
+        "radius": (bounds[0][1] - bounds[0][0]) / cells[0],
+        "materials": {"stuff": material},
+        "seed": 0,
+        "bodies": bodies,
     }
     return Scene.from_dict(content | changes)
 

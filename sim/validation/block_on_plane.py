@@ -38,12 +38,22 @@ def block_scene(angle: float, friction: float, cells: int = 32) -> Scene:
     point = np.array([0.5, 0.35])
     foot = point + along * (0.12 - 0.5) / np.cos(t)
     corners = [foot + along * s + up * h for s, h in ((0, 0), (0.25, 0), (0.25, 0.1), (0, 0.1))]
-    return Scene.model_validate({
-        "name": "block", "dim": 2, "bounds": [[0.0, 1.0], [0.0, 1.0]], "gravity": [0.0, -G], "frame_step": 0.005, "frames": 100, "radius": 0.1,
-        "cells": [cells, cells], "materials": {"block": {"model": "rigid", "density": 1000.0}}, "seed": 0,
-        "bodies": [{"material": "block", "kind": "polygon", "vertices": [corner.tolist() for corner in corners], "velocity": [0.0, 0.0]}],
-        "obstacles": [{"kind": "halfspace", "point": point.tolist(), "normal": up.tolist(), "friction": friction}],
-    })
+    return Scene.model_validate(
+        {
+            "name": "block",
+            "dim": 2,
+            "bounds": [[0.0, 1.0], [0.0, 1.0]],
+            "gravity": [0.0, -G],
+            "frame_step": 0.005,
+            "frames": 100,
+            "radius": 0.1,
+            "cells": [cells, cells],
+            "materials": {"block": {"model": "rigid", "density": 1000.0}},
+            "seed": 0,
+            "bodies": [{"material": "block", "kind": "polygon", "vertices": [corner.tolist() for corner in corners], "velocity": [0.0, 0.0]}],
+            "obstacles": [{"kind": "halfspace", "point": point.tolist(), "normal": up.tolist(), "friction": friction}],
+        }
+    )
 
 
 def block_on_plane(angle: float, friction: float, cells: int = 32, simulator: MPMSimulator | None = None) -> dict:
@@ -63,5 +73,10 @@ def block_on_plane(angle: float, friction: float, cells: int = 32, simulator: MP
     late = times > 0.1
     ours = 2 * np.polyfit(times[late], np.array(way)[late], 2)[0]
     reference = G * max(np.sin(t) - friction * np.cos(t), 0.0)
-    return {"reference": reference, "ours": float(ours), "error": float(abs(ours - reference) / G), "seconds": time.perf_counter() - begun,
-            "way": way[-1] - way[19]}
+    return {
+        "reference": reference,
+        "ours": float(ours),
+        "error": float(abs(ours - reference) / G),
+        "seconds": time.perf_counter() - begun,
+        "way": way[-1] - way[19],
+    }

@@ -24,8 +24,9 @@ def run(resolution: int) -> Outcome:
     step = 0.25 / resolution / (c + SPEED)
     frames = round(END / step)
     cells = [round((1 + 2 * margin) * resolution)] * 2
-    bodies = [{"kind": "ball", "center": center, "radius": RADIUS, "velocity": [sign * SPEED] * 2}
-              for center, sign in zip(CENTERS, (1, -1), strict=True)]
+    bodies = [
+        {"kind": "ball", "center": center, "radius": RADIUS, "velocity": [sign * SPEED] * 2} for center, sign in zip(CENTERS, (1, -1), strict=True)
+    ]
     what = scene("elastic-discs", {"model": "elastic", "density": RHO, "young_modulus": E, "poisson_ratio": NU}, bodies,
                  [[-margin, 1 + margin]] * 2, cells, step)  # fmt: skip
     solver = MPMSimulator()

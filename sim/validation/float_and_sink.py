@@ -64,14 +64,28 @@ def pool_scene(ratio: float, bottom: float, cells: int = 32, sound_speed: float 
     """
     left, right, top = 0.5 - WIDTH / 2, 0.5 + WIDTH / 2, bottom + HEIGHT
     water = [([0.0, 0.0], [left, DEPTH]), ([right, 0.0], [1.0, DEPTH]), ([left, 0.0], [right, min(bottom, DEPTH)]), ([left, top], [right, DEPTH])]
-    bodies = [{"material": "water", "kind": "box", "lower": lower, "upper": upper, "velocity": [0.0, 0.0]}
-              for lower, upper in water if lower[1] < upper[1] - 1e-9]
+    bodies = [
+        {"material": "water", "kind": "box", "lower": lower, "upper": upper, "velocity": [0.0, 0.0]}
+        for lower, upper in water
+        if lower[1] < upper[1] - 1e-9
+    ]
     bodies.append({"material": "box", "kind": "box", "lower": [left, bottom], "upper": [right, top], "velocity": [0.0, 0.0]})
-    return Scene.model_validate({
-        "name": "pool", "dim": 2, "bounds": [[0.0, 1.0], [0.0, 1.0]], "gravity": [0.0, -9.8], "frame_step": 0.01, "frames": 300, "radius": 0.1,
-        "cells": [cells, cells], "seed": 0, "bodies": bodies, "solver": {"method": method},
-        "materials": {"water": {"model": "water", "sound_speed": sound_speed}, "box": {"model": "rigid", "density": 1000.0 * ratio}},
-    })
+    return Scene.model_validate(
+        {
+            "name": "pool",
+            "dim": 2,
+            "bounds": [[0.0, 1.0], [0.0, 1.0]],
+            "gravity": [0.0, -9.8],
+            "frame_step": 0.01,
+            "frames": 300,
+            "radius": 0.1,
+            "cells": [cells, cells],
+            "seed": 0,
+            "bodies": bodies,
+            "solver": {"method": method},
+            "materials": {"water": {"model": "water", "sound_speed": sound_speed}, "box": {"model": "rigid", "density": 1000.0 * ratio}},
+        }
+    )
 
 
 def float_and_sink(ratio: float, bottom: float, cells: int = 32, seconds: float = 3.0, method: str = "mpm", simulator=None) -> dict:

@@ -158,8 +158,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
             for method, resolution in itertools.product(methods(case), module(case).RESOLUTIONS):
                 outcome = pool.submit(_run, case, resolution, method).result()
                 found[case].setdefault(method, []).append(outcome)
-                said = f"failed: {outcome}" if isinstance(outcome, str) else ", ".join(
-                    f"{name} {curve.error:.3g} ({curve.tolerance:g})" for name, curve in outcome.curves.items()) + f", {outcome.seconds:.1f} s"
+                said = (
+                    f"failed: {outcome}"
+                    if isinstance(outcome, str)
+                    else ", ".join(f"{name} {curve.error:.3g} ({curve.tolerance:g})" for name, curve in outcome.curves.items())
+                    + f", {outcome.seconds:.1f} s"
+                )
                 print(f"{case} {method} {resolution}: {said}", flush=True)
     import taichi
 
@@ -169,4 +173,3 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with atomic_path(options.out / "validation.md") as temporary:
         temporary.write_text(text)
     return 0 if holds else 1
-

@@ -31,7 +31,8 @@ def run(resolution: int, method: str) -> Outcome:
     solver = SPHSimulator()
     solver.load(what)
     found, seconds = timed(
-        solver.frame, round(SECONDS / what.frame_step), lambda x: (x.astype(float), np.maximum(solver.state()["density"] - 1, 0).mean()))
+        solver.frame, round(SECONDS / what.frame_step), lambda x: (x.astype(float), np.maximum(solver.state()["density"] - 1, 0).mean())
+    )
     frames = np.arange(0, len(found), 100) + 99
     volume = np.array([water_area(found[frame][0], what) for frame in frames]) / L**2
     excess = np.array([each for _, each in found])

@@ -25,10 +25,26 @@ def bounce(seed: int, particles: int = 24, frames: int = 40) -> Trajectory:
         position = np.where(low, 2 * lower - position, np.where(high, 2 * upper - position, position))
         velocity = np.where(low | high, -0.6 * velocity, velocity)
     scene = {
-        "name": "bounce", "dim": 2, "bounds": [[lower, upper]] * 2, "gravity": list(GRAVITY), "frame_step": FRAME_STEP, "frames": frames,
-        "radius": 0.1, "spacing": 0.05, "grid_spacing": 0.1, "refine": 1, "materials": {}, "bodies": [],
+        "name": "bounce",
+        "dim": 2,
+        "bounds": [[lower, upper]] * 2,
+        "gravity": list(GRAVITY),
+        "frame_step": FRAME_STEP,
+        "frames": frames,
+        "radius": 0.1,
+        "spacing": 0.05,
+        "grid_spacing": 0.1,
+        "refine": 1,
+        "materials": {},
+        "bodies": [],
     }
     return Trajectory(
-        position=np.stack(path), particle_type=np.full(particles, 5, np.int8), frame_step=FRAME_STEP, radius=0.1,
-        bounds=np.array([[lower, upper]] * 2), scene=scene, seed=seed, simulator={"name": "bounce"},
+        position=np.stack(path),
+        particle_type=np.full(particles, 5, np.int8),
+        frame_step=FRAME_STEP,
+        radius=0.1,
+        bounds=np.array([[lower, upper]] * 2),
+        scene=scene,
+        seed=seed,
+        simulator={"name": "bounce"},
     )

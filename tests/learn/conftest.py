@@ -36,9 +36,13 @@ def _write_dataset(folder: Path, splits: dict[str, dict[int, Trajectory]], per_s
     velocity = np.concatenate([(p[1:] - p[:-1]).reshape(-1, p.shape[2]) for p in moving])
     acceleration = np.concatenate([(p[2:] - 2 * p[1:-1] + p[:-2]).reshape(-1, p.shape[2]) for p in moving])
     content["statistics"] = {
-        "velocity_mean": velocity.mean(0).tolist(), "velocity_std": velocity.std(0).tolist(),
-        "acceleration_mean": acceleration.mean(0).tolist(), "acceleration_std": acceleration.std(0).tolist(),
-        "particles": [24, 24.0, 24], "frames": moving[0].shape[0], "neighbours": 5.0,
+        "velocity_mean": velocity.mean(0).tolist(),
+        "velocity_std": velocity.std(0).tolist(),
+        "acceleration_mean": acceleration.mean(0).tolist(),
+        "acceleration_std": acceleration.std(0).tolist(),
+        "particles": [24, 24.0, 24],
+        "frames": moving[0].shape[0],
+        "neighbours": 5.0,
     }
     (folder / "dataset.json").write_text(json.dumps(content))
     return folder

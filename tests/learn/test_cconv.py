@@ -28,9 +28,18 @@ PUBLISHED = {"conv0_fluid": (4, 4), "conv0_obstacle": (3, 4), "conv1": (12, 6), 
 
 def spec(dim: int = 3, **changes: object) -> DataSpec:
     values = {
-        "dim": dim, "bounds": ((0.0, 1.0),) * dim, "radius": 0.2, "spacing": 0.1, "frame_step": 0.01, "stride": 1,
-        "gravity": (0.0, GRAVITY, 0.0)[:dim], "particle_types": (5,), "velocity_mean": (0.0,) * dim, "velocity_std": (1e-2,) * dim,
-        "acceleration_mean": (0.0,) * dim, "acceleration_std": (1e-3,) * dim,
+        "dim": dim,
+        "bounds": ((0.0, 1.0),) * dim,
+        "radius": 0.2,
+        "spacing": 0.1,
+        "frame_step": 0.01,
+        "stride": 1,
+        "gravity": (0.0, GRAVITY, 0.0)[:dim],
+        "particle_types": (5,),
+        "velocity_mean": (0.0,) * dim,
+        "velocity_std": (1e-2,) * dim,
+        "acceleration_mean": (0.0,) * dim,
+        "acceleration_std": (1e-3,) * dim,
     }
     return DataSpec(**{**values, **changes})
 
@@ -65,8 +74,13 @@ def windows(frames: int, particles: int = 40, dim: int = 3, seed: int = 0, examp
 def start(position: np.ndarray, **changes: object) -> Start:
     dim = position.shape[2]
     values = {
-        "history": position.astype(np.float32), "particle_type": np.full(position.shape[1], 5, np.int8), "present": len(position) - 1,
-        "frame_step": 0.01, "radius": 0.2, "bounds": np.array([[0.0, 1.0]] * dim), "scene": {"gravity": [0.0, GRAVITY, 0.0][:dim]},
+        "history": position.astype(np.float32),
+        "particle_type": np.full(position.shape[1], 5, np.int8),
+        "present": len(position) - 1,
+        "frame_step": 0.01,
+        "radius": 0.2,
+        "bounds": np.array([[0.0, 1.0]] * dim),
+        "scene": {"gravity": [0.0, GRAVITY, 0.0][:dim]},
     }
     return Start(**{**values, **changes})
 
@@ -76,6 +90,7 @@ def start(position: np.ndarray, **changes: object) -> Start:
 
 def to_cube(x: np.ndarray) -> np.ndarray:
     """Ball to cylinder along z, cylinder to cube (Griepentrog et al. 2008, as the original's appendix gives it)."""
+
     def square(x: float, y: float) -> tuple[float, float]:
         r = math.hypot(x, y)
         if r == 0:
@@ -492,6 +507,7 @@ def test_unrolling_follows_the_progress():
 
 def flying(model: CConv) -> CConv:
     """A network that gives back the g / 2 by which flight falls short when the velocity is a difference of positions."""
+
     class Flight(nn.Module):
         def forward(self, features: Tensor, pairs: Pairs, boundary: Tensor, boundary_pairs: Pairs) -> Tensor:
             return (model.gravity / 2 / model.scale).expand(len(features), -1)

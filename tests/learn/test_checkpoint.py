@@ -83,7 +83,6 @@ def test_bomb_would_have_gone_off(tmp_path: Path) -> None:
     assert (tmp_path / "exploded").exists()
 
 
-
 def edited(saved: Path, **changes: object) -> Path:
     """The file with some keys replaced, or left out where the change is ``...``."""
     content = torch.load(saved, weights_only=True) | changes
@@ -92,22 +91,42 @@ def edited(saved: Path, **changes: object) -> Path:
     return path
 
 
-@pytest.mark.parametrize(("changes", "key"), [
-    ({"format": "other"}, "format"), ({"format_version": 2}, "format_version"), ({"model": "nobody"}, "model"), ({"model": 3}, "model"),
-    ({"settings": {"nose": 1}}, "nose"), ({"settings": {"noise": -1}}, "noise"), ({"settings": []}, "settings"), ({"spec": {}}, "spec"),
-    ({"spec": ...}, "keys"), ({"more": 1}, "keys"), ({"state_dict": {}}, "state_dict"), ({"provenance": None}, "provenance"),
-    ({"model": "gns", "settings": {"latent": 10**12}}, "settings"),
-])
+@pytest.mark.parametrize(
+    ("changes", "key"),
+    [
+        ({"format": "other"}, "format"),
+        ({"format_version": 2}, "format_version"),
+        ({"model": "nobody"}, "model"),
+        ({"model": 3}, "model"),
+        ({"settings": {"nose": 1}}, "nose"),
+        ({"settings": {"noise": -1}}, "noise"),
+        ({"settings": []}, "settings"),
+        ({"spec": {}}, "spec"),
+        ({"spec": ...}, "keys"),
+        ({"more": 1}, "keys"),
+        ({"state_dict": {}}, "state_dict"),
+        ({"provenance": None}, "provenance"),
+        ({"model": "gns", "settings": {"latent": 10**12}}, "settings"),
+    ],
+)
 def test_wrong_contents(saved: Path, changes: dict, key: str) -> None:
     path = edited(saved, **changes)
     with pytest.raises(InputError, match=rf"edited\.pt: .*{key}"):
         load_model(path)
 
 
-@pytest.mark.parametrize("weight", [
-    1.0, None, torch.zeros(3, 3), torch.zeros(2, 2, dtype=torch.float64), torch.full((2, 2), float("nan")),
-    torch.zeros(2, 2).to_sparse(), torch.zeros(2, 2, device="meta"),
-])
+@pytest.mark.parametrize(
+    "weight",
+    [
+        1.0,
+        None,
+        torch.zeros(3, 3),
+        torch.zeros(2, 2, dtype=torch.float64),
+        torch.full((2, 2), float("nan")),
+        torch.zeros(2, 2).to_sparse(),
+        torch.zeros(2, 2, device="meta"),
+    ],
+)
 def test_wrong_weights(saved: Path, weight: object) -> None:
     weights = torch.load(saved, weights_only=True)["state_dict"] | {"linear.weight": weight}
     with pytest.raises(InputError, match=r"linear\.weight"):

@@ -98,8 +98,10 @@ def test_rows_tell_the_numbers_of_a_context():
 
 def test_failures_are_rows():
     contenders = [
-        Off("breaks", TRUTHS, 0.0, fails_at=10), Off("stops", TRUTHS, 0.0, fails_at=8, fault="raise"),
-        Off("fails at once", TRUTHS, 0.0, fails_at=0, fault="raise"), Off("one of three", TRUTHS[:1], 0.0),
+        Off("breaks", TRUTHS, 0.0, fails_at=10),
+        Off("stops", TRUTHS, 0.0, fails_at=8, fault="raise"),
+        Off("fails at once", TRUTHS, 0.0, fails_at=0, fault="raise"),
+        Off("one of three", TRUTHS[:1], 0.0),
     ]
     contenders[3].begin = lambda start, begin=contenders[3].begin: _begin_or_fail(begin, start)
     found = by_name(c.compare(contenders, TRUTHS, SETTINGS))
@@ -151,7 +153,10 @@ def test_one_row_per_scene():
     truths = [trajectory(0, scene="a"), trajectory(1, scene="b"), trajectory(2, scene="b")]
     rows = c.compare([Frozen(), ConstantVelocity()], truths, SETTINGS)
     assert [(row["scene"], row["contender"], row["trajectories"]) for row in rows] == [
-        ("a", "frozen", 1), ("a", "constant velocity", 1), ("b", "frozen", 2), ("b", "constant velocity", 2),
+        ("a", "frozen", 1),
+        ("a", "constant velocity", 1),
+        ("b", "frozen", 2),
+        ("b", "constant velocity", 2),
     ]
 
 
@@ -227,10 +232,20 @@ def test_hardware_and_versions_are_recorded():
 
 def row(name, kind, error, seconds, spread=0.0, failures=0, **more):
     return {
-        "scene": "sand", "reference": "teacher", "contender": name, "kind": kind, "failures": failures, "runs": 10, "trajectories": 10, "frames": 100,
+        "scene": "sand",
+        "reference": "teacher",
+        "contender": name,
+        "kind": kind,
+        "failures": failures,
+        "runs": 10,
+        "trajectories": 10,
+        "frames": 100,
         "status": f"failed in {failures} of 10: non-finite position (frame 9)" if failures else "ok",
-        "rollout_mse_moving": {"20": None if error is None else error / 4, "all": error}, "emd": {"0.5": 1.0, "1": 2.0}, "seconds_per_frame": seconds,
-        "timing_spread": {"seconds_per_frame": [seconds * (1 - spread), seconds * (1 + spread)], "n": 5}, **more,
+        "rollout_mse_moving": {"20": None if error is None else error / 4, "all": error},
+        "emd": {"0.5": 1.0, "1": 2.0},
+        "seconds_per_frame": seconds,
+        "timing_spread": {"seconds_per_frame": [seconds * (1 - spread), seconds * (1 + spread)], "n": 5},
+        **more,
     }
 
 
@@ -350,8 +365,10 @@ def test_the_verdict_on_several_scenes_counts():
     assert text.startswith("No learned model wins at equal error (rollout MSE of moving particles over all frames) on any of the 2 scenes.")
     assert text.endswith("On 2 the best loses to the solver, by the least on goop, where grid takes 2 times as long.")
     more = (
-        elsewhere("water", row("gns", "learned", 5e-5, 0.8)) + elsewhere("snow", row("gns", "learned", 0.5, 0.1))
-        + elsewhere("jelly", row("gns", "learned", None, 0.1, failures=10)) + elsewhere("mud", row("gns", "learned", 1e-3, 0.9, spread=0.2))
+        elsewhere("water", row("gns", "learned", 5e-5, 0.8))
+        + elsewhere("snow", row("gns", "learned", 0.5, 0.1))
+        + elsewhere("jelly", row("gns", "learned", None, 0.1, failures=10))
+        + elsewhere("mud", row("gns", "learned", 1e-3, 0.9, spread=0.2))
     )
     missed = c.Target("snow", "gns", c.MOVING_MSE, high=0.1)
     text = c.verdict(loses + more, [missed])
@@ -374,12 +391,18 @@ def test_targets():
     model = row("gns", "learned", 1e-3, 8.0)
     rows = [*TRIVIAL, model]
     reached = c.Target("sand", "gns", c.MOVING_MSE, high=0.2, relative_to="ballistic")
-    missed = c.missed_targets(rows, [
-        reached, c.Target("sand", "gns", c.Yardstick("emd", "1"), high=1.5), c.Target("sand", "gns", c.Yardstick("emd", "0.5"), low=1.5, high=3),
-        c.Target("sand", "none", c.MOVING_MSE, high=1),
-    ])
+    missed = c.missed_targets(
+        rows,
+        [
+            reached,
+            c.Target("sand", "gns", c.Yardstick("emd", "1"), high=1.5),
+            c.Target("sand", "gns", c.Yardstick("emd", "0.5"), low=1.5, high=3),
+            c.Target("sand", "none", c.MOVING_MSE, high=1),
+        ],
+    )
     assert missed == [
-        "gns on sand: EMD at the end is 2, not at most 1.5", "gns on sand: EMD at 50% of the run is 1, not at least 1.5",
+        "gns on sand: EMD at the end is 2, not at most 1.5",
+        "gns on sand: EMD at 50% of the run is 1, not at least 1.5",
         "none on sand: rollout MSE of moving particles over all frames is unknown",
     ]
     assert c.verdict(rows, [reached]).endswith("The target of the study is reached.")

@@ -23,8 +23,15 @@ def trajectory(position: np.ndarray, kinds: list[int] | None = None, context: np
     position = np.asarray(position, np.float32)
     scene = {"spacing": 0.1, "gravity": [0.0, -1.0], **changes.pop("scene", {})}
     values = dict(
-        position=position, particle_type=np.asarray(kinds or [5] * position.shape[1], np.int8), frame_step=0.1, radius=0.2,
-        bounds=np.array([[0.0, 1.0]] * 2), scene=scene, seed=0, simulator={"name": "hand"}, context=context,
+        position=position,
+        particle_type=np.asarray(kinds or [5] * position.shape[1], np.int8),
+        frame_step=0.1,
+        radius=0.2,
+        bounds=np.array([[0.0, 1.0]] * 2),
+        scene=scene,
+        seed=0,
+        simulator={"name": "hand"},
+        context=context,
     )
     return Trajectory(**(values | changes))
 
@@ -119,18 +126,43 @@ def test_spec_survives_json(bounce_dataset: Path) -> None:
 
 
 SPEC = {
-    "dim": 2, "bounds": [[0, 1], [0, 1]], "radius": 0.1, "spacing": 0.05, "frame_step": 0.01, "stride": 1, "gravity": [0, -1],
-    "particle_types": [5], "velocity_mean": [0, 0], "velocity_std": [1, 1], "acceleration_mean": [0, 0], "acceleration_std": [1, 1],
-    "context_mean": None, "context_std": None,
+    "dim": 2,
+    "bounds": [[0, 1], [0, 1]],
+    "radius": 0.1,
+    "spacing": 0.05,
+    "frame_step": 0.01,
+    "stride": 1,
+    "gravity": [0, -1],
+    "particle_types": [5],
+    "velocity_mean": [0, 0],
+    "velocity_std": [1, 1],
+    "acceleration_mean": [0, 0],
+    "acceleration_std": [1, 1],
+    "context_mean": None,
+    "context_std": None,
 }
 SCALARS = st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5)
 JSON = st.recursive(SCALARS, lambda inner: st.lists(inner, max_size=3), max_leaves=4)
 
 
-@pytest.mark.parametrize("change", [
-    {"dim": 4}, {"dim": 3}, {"bounds": [[1, 0], [0, 1]]}, {"radius": 0}, {"radius": float("nan")}, {"stride": 1.5}, {"stride": True},
-    {"particle_types": []}, {"particle_types": [6, 5]}, {"particle_types": [9]}, {"velocity_std": [1, -1]}, {"context_mean": [1.0]}, {"more": 1},
-])
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"dim": 4},
+        {"dim": 3},
+        {"bounds": [[1, 0], [0, 1]]},
+        {"radius": 0},
+        {"radius": float("nan")},
+        {"stride": 1.5},
+        {"stride": True},
+        {"particle_types": []},
+        {"particle_types": [6, 5]},
+        {"particle_types": [9]},
+        {"velocity_std": [1, -1]},
+        {"context_mean": [1.0]},
+        {"more": 1},
+    ],
+)
 def test_spec_refuses(change: dict) -> None:
     with pytest.raises(InputError, match="there"):
         DataSpec.from_dict(SPEC | change, "there")
@@ -203,10 +235,17 @@ def test_failed_trajectories_are_left_out(tmp_path: Path, write_dataset) -> None
     assert len(dataset) == 2 and dataset.trajectory(1).position.shape == (6, 3, 2)
 
 
-@pytest.mark.parametrize(("change", "key"), [
-    ({"radius": 0.3}, "radius"), ({"frame_step": 0.2}, "frame_step"), ({"bounds": np.array([[0, 2], [0, 1]])}, "bounds"),
-    ({"scene": {"spacing": 0.2}}, "spacing"), ({"scene": {"gravity": [1.0, 0.0]}}, "gravity"), ({"scene": {"gravity": None}}, "scene"),
-])
+@pytest.mark.parametrize(
+    ("change", "key"),
+    [
+        ({"radius": 0.3}, "radius"),
+        ({"frame_step": 0.2}, "frame_step"),
+        ({"bounds": np.array([[0, 2], [0, 1]])}, "bounds"),
+        ({"scene": {"spacing": 0.2}}, "spacing"),
+        ({"scene": {"gravity": [1.0, 0.0]}}, "gravity"),
+        ({"scene": {"gravity": None}}, "scene"),
+    ],
+)
 def test_unlike_trajectories_are_refused(tmp_path: Path, write_dataset, change: dict, key: str) -> None:
     folder = write_dataset(tmp_path, {"train": {0: trajectory(ramp(6, 2)), 1: trajectory(ramp(6, 2), **change)}})
     with pytest.raises(InputError, match=key):
@@ -218,14 +257,25 @@ def copy(bounce_dataset: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(bounce_dataset, tmp_path / "copy"))
 
 
-@pytest.mark.parametrize("content", [
-    "", "{", "[]", "\x00", '{"format_version": 2}', '{"format_version": 1}', '{"format_version": 1, "splits": {}}',
-    '{"format_version": 1, "splits": {"train": []}}', '{"format_version": 1, "splits": {"train": {"shards": [1]}}}',
-    '{"format_version": 1, "splits": {"train": {"shards": []}}}', '{"format_version": 1, "splits": {"train": {"shards": ["train/none.h5"]}}}',
-    '{"format_version": 1, "splits": {"train": {"shards": ["train/shard-00000.h5"]}}}',
-    '{"format_version": 1, "splits": {"train": {"shards": ["train/shard-00000.h5"]}}, "statistics": {"velocity_mean": ["a", 1]}}',
-    "[" * 100_000,
-])
+@pytest.mark.parametrize(
+    "content",
+    [
+        "",
+        "{",
+        "[]",
+        "\x00",
+        '{"format_version": 2}',
+        '{"format_version": 1}',
+        '{"format_version": 1, "splits": {}}',
+        '{"format_version": 1, "splits": {"train": []}}',
+        '{"format_version": 1, "splits": {"train": {"shards": [1]}}}',
+        '{"format_version": 1, "splits": {"train": {"shards": []}}}',
+        '{"format_version": 1, "splits": {"train": {"shards": ["train/none.h5"]}}}',
+        '{"format_version": 1, "splits": {"train": {"shards": ["train/shard-00000.h5"]}}}',
+        '{"format_version": 1, "splits": {"train": {"shards": ["train/shard-00000.h5"]}}, "statistics": {"velocity_mean": ["a", 1]}}',
+        "[" * 100_000,
+    ],
+)
 def test_bad_dataset_json(copy: Path, content: str) -> None:
     (copy / "dataset.json").write_text(content)
     with pytest.raises(InputError) as error:
@@ -238,7 +288,6 @@ def test_missing_data_set_and_split(tmp_path: Path, bounce_dataset: Path) -> Non
         Dataset(tmp_path, "train")
     with pytest.raises(InputError, match="holds test, train, valid"):
         Dataset(bounce_dataset, "validation")
-
 
 
 def test_non_finite_positions_are_refused(copy: Path) -> None:

@@ -24,8 +24,14 @@ torch.set_num_threads(1)
 
 def metadata(dim: int, **changes) -> dict:
     values = {
-        "bounds": [[0.1, 0.9]] * dim, "sequence_length": 320, "default_connectivity_radius": 0.15, "dim": dim, "dt": 0.0025,
-        "vel_mean": [1e-4, -3e-4, 2e-4][:dim], "vel_std": [2.2e-3, 2.7e-3, 1.9e-3][:dim], "acc_mean": [1e-6, -2e-5, 3e-6][:dim],
+        "bounds": [[0.1, 0.9]] * dim,
+        "sequence_length": 320,
+        "default_connectivity_radius": 0.15,
+        "dim": dim,
+        "dt": 0.0025,
+        "vel_mean": [1e-4, -3e-4, 2e-4][:dim],
+        "vel_std": [2.2e-3, 2.7e-3, 1.9e-3][:dim],
+        "acc_mean": [1e-6, -2e-5, 3e-6][:dim],
         "acc_std": [2.6e-4, 3.0e-4, 2.8e-4][:dim],
     }
     return values | changes
@@ -96,16 +102,30 @@ def test_both_directions_give_equal_outputs(tmp_path, dim, types, edges, sizes, 
 
 def spec(**changes) -> DataSpec:
     values = dict(
-        dim=2, bounds=((0.0, 1.0), (0.0, 1.0)), radius=0.15, spacing=0.05, frame_step=0.01, stride=1, gravity=(0.0, -9.81), particle_types=(5,),
-        velocity_mean=(1e-4, 0.0), velocity_std=(3e-3, 2e-3), acceleration_mean=(0.0, -2e-4), acceleration_std=(3e-4, 0.0),
+        dim=2,
+        bounds=((0.0, 1.0), (0.0, 1.0)),
+        radius=0.15,
+        spacing=0.05,
+        frame_step=0.01,
+        stride=1,
+        gravity=(0.0, -9.81),
+        particle_types=(5,),
+        velocity_mean=(1e-4, 0.0),
+        velocity_std=(3e-3, 2e-3),
+        acceleration_mean=(0.0, -2e-4),
+        acceleration_std=(3e-4, 0.0),
     )
     return DataSpec(**(values | changes))
 
 
-@pytest.mark.parametrize(("settings", "changes"), [
-    ({"shared": True}, {}), ({"ballistic": True, "wall_distance": 5.0}, {"context_mean": (30.0,), "context_std": (7.0,)}),
-    ({"edge_update": False, "noise": 0.0, "radius": 2.0, "history": 2}, {"particle_types": (3, 5)}),
-])
+@pytest.mark.parametrize(
+    ("settings", "changes"),
+    [
+        ({"shared": True}, {}),
+        ({"ballistic": True, "wall_distance": 5.0}, {"context_mean": (30.0,), "context_std": (7.0,)}),
+        ({"edge_update": False, "noise": 0.0, "radius": 2.0, "history": 2}, {"particle_types": (3, 5)}),
+    ],
+)
 def test_a_model_of_ours_goes_to_the_port(tmp_path, settings, changes):
     torch.manual_seed(0)
     model = build("gns", {"latent": 16, "message_passing": 3} | settings, spec(**changes))
@@ -132,24 +152,27 @@ def test_the_commands(tmp_path, capsys):
     assert main(["export-model", str(out), "--out", str(tmp_path / "port")]) == 2
 
 
-@pytest.mark.parametrize(("weights", "content", "message"), [
-    ({}, {}, "model-100.pt: state_dict"),
-    ({"optimizer_state": {}}, {}, "train_state"),
-    ([1], {}, "state_dict = 'list'"),
-    ({**state_dict(2, 8, 2), "more": torch.zeros(1)}, {}, "more = \\[1\\]: must be absent"),
-    ({**state_dict(2, 8, 2), f"{ROOT}_decoder.node_fn.NN-2.bias": torch.zeros(3)}, {}, "NN-2.bias = \\[3\\]: must be \\[2\\]"),
-    ({**state_dict(2, 8, 2), f"{ROOT}_encoder.node_fn.0.NN-0.weight": torch.zeros(8, 20)}, {}, "must have 16 \\+ 4 columns"),
-    ({**state_dict(2, 8, 2), f"{ROOT}_decoder.node_fn.NN-2.bias": torch.zeros(2).double()}, {}, "dense float32"),
-    ({**state_dict(2, 8, 2), f"{ROOT}_encoder.node_fn.0.NN-0.weight": torch.zeros(1).expand(10**6, 30)}, {}, "dense float32"),
-    ({**state_dict(2, 8, 2), f"{ROOT}_decoder.node_fn.NN-2.bias": torch.full((2,), torch.nan)}, {}, "must be finite"),
-    ({**state_dict(2, 8, 2), "_particle_type_embedding.weight": torch.zeros(1, 16)}, {}, "must be \\[9, 16\\]"),
-    (state_dict(3, 8, 2), {}, "NN-2.bias = \\[3\\]: must be \\[2\\]"),
-    (state_dict(2, 8, 2), {"dim": 4}, "metadata.json: dim = 4"),
-    (state_dict(2, 8, 2), {"vel_std": [1.0]}, "metadata.json: metadata = .*velocity_std"),
-    (state_dict(2, 8, 2), {"acc_std": ["a", 1]}, "metadata.json: acc_std.0 = 'a'"),
-    (state_dict(2, 8, 2), {"default_connectivity_radius": None}, "default_connectivity_radius"),
-    (state_dict(2, 8, 2), {"gravity": [0.0]}, "gravity"),
-])
+@pytest.mark.parametrize(
+    ("weights", "content", "message"),
+    [
+        ({}, {}, "model-100.pt: state_dict"),
+        ({"optimizer_state": {}}, {}, "train_state"),
+        ([1], {}, "state_dict = 'list'"),
+        ({**state_dict(2, 8, 2), "more": torch.zeros(1)}, {}, "more = \\[1\\]: must be absent"),
+        ({**state_dict(2, 8, 2), f"{ROOT}_decoder.node_fn.NN-2.bias": torch.zeros(3)}, {}, "NN-2.bias = \\[3\\]: must be \\[2\\]"),
+        ({**state_dict(2, 8, 2), f"{ROOT}_encoder.node_fn.0.NN-0.weight": torch.zeros(8, 20)}, {}, "must have 16 \\+ 4 columns"),
+        ({**state_dict(2, 8, 2), f"{ROOT}_decoder.node_fn.NN-2.bias": torch.zeros(2).double()}, {}, "dense float32"),
+        ({**state_dict(2, 8, 2), f"{ROOT}_encoder.node_fn.0.NN-0.weight": torch.zeros(1).expand(10**6, 30)}, {}, "dense float32"),
+        ({**state_dict(2, 8, 2), f"{ROOT}_decoder.node_fn.NN-2.bias": torch.full((2,), torch.nan)}, {}, "must be finite"),
+        ({**state_dict(2, 8, 2), "_particle_type_embedding.weight": torch.zeros(1, 16)}, {}, "must be \\[9, 16\\]"),
+        (state_dict(3, 8, 2), {}, "NN-2.bias = \\[3\\]: must be \\[2\\]"),
+        (state_dict(2, 8, 2), {"dim": 4}, "metadata.json: dim = 4"),
+        (state_dict(2, 8, 2), {"vel_std": [1.0]}, "metadata.json: metadata = .*velocity_std"),
+        (state_dict(2, 8, 2), {"acc_std": ["a", 1]}, "metadata.json: acc_std.0 = 'a'"),
+        (state_dict(2, 8, 2), {"default_connectivity_radius": None}, "default_connectivity_radius"),
+        (state_dict(2, 8, 2), {"gravity": [0.0]}, "gravity"),
+    ],
+)
 def test_faults_are_one_line(tmp_path, weights, content, message):
     paths = write(tmp_path, weights, metadata(2, edges="updated", spacing=0.1, gravity=[0, 0], particle_types=[5]) | content)
     with pytest.raises(InputError, match=message) as caught:
@@ -178,13 +201,21 @@ def test_files_that_are_not_there_or_not_theirs(tmp_path):
         import_model(model, content)
 
 
-@pytest.mark.parametrize(("settings", "changes", "key"), [
-    ({"inputs": "last"}, {}, "inputs"), ({"relative_velocity": True}, {}, "relative_velocity"), ({"ballistic": True, "walls": True}, {}, "walls"),
-    ({"self_edges": False}, {}, "self_edges"), ({"encoder": "absolute"}, {}, "encoder"),
-    ({"ballistic": True, "flight_below": 2}, {}, "flight_below"), ({"relaxation": {}}, {}, "relaxation"), ({}, {"stride": 2}, "stride"),
-    ({}, {"periodic": ("x",)}, "periodic"),
-    ({}, {"context_mean": (0.0, 0.0), "context_std": (1.0, 1.0)}, "context"),
-])
+@pytest.mark.parametrize(
+    ("settings", "changes", "key"),
+    [
+        ({"inputs": "last"}, {}, "inputs"),
+        ({"relative_velocity": True}, {}, "relative_velocity"),
+        ({"ballistic": True, "walls": True}, {}, "walls"),
+        ({"self_edges": False}, {}, "self_edges"),
+        ({"encoder": "absolute"}, {}, "encoder"),
+        ({"ballistic": True, "flight_below": 2}, {}, "flight_below"),
+        ({"relaxation": {}}, {}, "relaxation"),
+        ({}, {"stride": 2}, "stride"),
+        ({}, {"periodic": ("x",)}, "periodic"),
+        ({}, {"context_mean": (0.0, 0.0), "context_std": (1.0, 1.0)}, "context"),
+    ],
+)
 def test_what_the_port_cannot_be_is_refused(tmp_path, settings, changes, key):
     model = build("gns", {"latent": 8, "message_passing": 1} | settings, spec(**changes))
     with pytest.raises(InputError, match=key):

@@ -11,8 +11,18 @@ from learn.graph import radius_graph
 
 def spec(**changes) -> DataSpec:
     values = dict(
-        dim=2, bounds=((0.0, 1.0), (0.0, 2.0)), radius=0.5, spacing=0.25, frame_step=0.1, stride=2, gravity=(0.0, -10.0), particle_types=(5,),
-        velocity_mean=(0.1, 0.0), velocity_std=(0.3, 0.4), acceleration_mean=(0.0, 0.5), acceleration_std=(0.6, 0.8),
+        dim=2,
+        bounds=((0.0, 1.0), (0.0, 2.0)),
+        radius=0.5,
+        spacing=0.25,
+        frame_step=0.1,
+        stride=2,
+        gravity=(0.0, -10.0),
+        particle_types=(5,),
+        velocity_mean=(0.1, 0.0),
+        velocity_std=(0.3, 0.4),
+        acceleration_mean=(0.0, 0.5),
+        acceleration_std=(0.6, 0.8),
     )
     return DataSpec(**(values | changes))
 
@@ -22,11 +32,7 @@ def features(data: DataSpec, **changes) -> Features:
     return Features(data, **(values | changes))
 
 
-POSITION = torch.tensor([
-    [[0.00, 1.0], [0.5, 1.0], [0.9, 1.9]],
-    [[0.10, 1.0], [0.5, 1.4], [0.9, 1.9]],
-    [[0.30, 1.0], [0.5, 1.0], [0.9, 1.9]],
-])
+POSITION = torch.tensor([[[0.00, 1.0], [0.5, 1.0], [0.9, 1.9]], [[0.10, 1.0], [0.5, 1.4], [0.9, 1.9]], [[0.30, 1.0], [0.5, 1.0], [0.9, 1.9]]])
 TYPE = torch.tensor([5, 5, 5])
 
 
@@ -37,11 +43,10 @@ def near(values: torch.Tensor, wanted: list) -> None:
 def test_hand_computed_nodes():
     made = features(spec())
     assert (made.node_width, made.edge_width) == (8, 3)
-    near(made.nodes(POSITION, TYPE, made.bounds), [
-        [0, 0, 1 / 3, 0, 0.6, 1, 1, 1],
-        [-1 / 3, 1, -1 / 3, -1, 1, 1, 1, 1],
-        [-1 / 3, 0, -1 / 3, 0, 1, 1, 0.2, 0.2],
-    ])
+    near(
+        made.nodes(POSITION, TYPE, made.bounds),
+        [[0, 0, 1 / 3, 0, 0.6, 1, 1, 1], [-1 / 3, 1, -1 / 3, -1, 1, 1, 1, 1], [-1 / 3, 0, -1 / 3, 0, 1, 1, 0.2, 0.2]],
+    )
 
 
 def test_particles_outside_the_box_see_negative_distances():
@@ -50,10 +55,10 @@ def test_particles_outside_the_box_see_negative_distances():
 
 
 def test_acceleration_scaling_and_last_velocity():
-    near(features(spec(), scaling="acceleration").nodes(POSITION, TYPE, torch.tensor(spec().bounds))[:2, :4], [
-        [0.1 / 0.6, -0.5 / 0.8, 1 / 3, 0],
-        [0, (-0.8 - 0.5) / 0.8, -1 / 3, -1],
-    ])
+    near(
+        features(spec(), scaling="acceleration").nodes(POSITION, TYPE, torch.tensor(spec().bounds))[:2, :4],
+        [[0.1 / 0.6, -0.5 / 0.8, 1 / 3, 0], [0, (-0.8 - 0.5) / 0.8, -1 / 3, -1]],
+    )
     last = features(spec(), scaling="last")
     assert last.node_width == 6
     near(last.nodes(POSITION, TYPE, last.bounds)[0, :2], [1 / 3, 0])
@@ -63,13 +68,9 @@ def test_hand_computed_edges():
     made = features(spec(), relative_velocity=True)
     graph = radius_graph(POSITION[-1], 0.5)
     assert list(zip(graph.receiver.tolist(), graph.sender.tolist(), strict=True)) == [(0, 0), (0, 1), (1, 0), (1, 1), (2, 2)]
-    near(made.edges(POSITION, graph), [
-        [0, 0, 0, 0, 0],
-        [0.4, 0, 0.4, -0.2 / 0.3, -1],
-        [-0.4, 0, 0.4, 0.2 / 0.3, 1],
-        [0, 0, 0, 0, 0],
-        [0, 0, 0, 0, 0],
-    ])
+    near(
+        made.edges(POSITION, graph), [[0, 0, 0, 0, 0], [0.4, 0, 0.4, -0.2 / 0.3, -1], [-0.4, 0, 0.4, 0.2 / 0.3, 1], [0, 0, 0, 0, 0], [0, 0, 0, 0, 0]]
+    )
     assert features(spec()).edges(POSITION, graph).shape == (5, 3)
 
 

@@ -16,9 +16,15 @@ def row(name, kind, error, seconds, failures=0, scene="sand"):
         return {part: [None if level is None else level * k * factor for k in (1, 2, 3)] for part, factor in parts}
 
     return {
-        "scene": scene, "reference": "teacher", "contender": name, "kind": kind,
-        "failures": failures, "status": "failed in 1 of 3" if failures else "ok",
-        "rollout_mse_moving": {"all": error}, "seconds_per_frame": seconds, "frame_step": 0.01,
+        "scene": scene,
+        "reference": "teacher",
+        "contender": name,
+        "kind": kind,
+        "failures": failures,
+        "status": "failed in 1 of 3" if failures else "ok",
+        "rollout_mse_moving": {"all": error},
+        "seconds_per_frame": seconds,
+        "frame_step": 0.01,
         "timing_spread": {"seconds_per_frame": [seconds * 0.9, seconds * 1.2], "n": 5} if seconds else None,
         "spread": {end: {"rollout_mse_moving": {"all": error and error * factor}} for end, factor in (("min", 0.5), ("max", 2))},
         "curves": {"frame": [1, 50, 100], "mse": curve(error), "kinetic_energy": curve(1.1), "kinetic_energy_true": curve(1.0)},
@@ -26,10 +32,15 @@ def row(name, kind, error, seconds, failures=0, scene="sand"):
 
 
 ROWS = [
-    row("teacher", "reference", 0.0, 2e-3), *(row(f"dt x{k}", "solver", 1e-6 * k, 2e-3 / k) for k in (2, 3, 4)),
+    row("teacher", "reference", 0.0, 2e-3),
+    *(row(f"dt x{k}", "solver", 1e-6 * k, 2e-3 / k) for k in (2, 3, 4)),
     *(row(f"twin {k}", "solver", 1.02e-6 * k, 2.05e-3 / k) for k in (2, 3, 4)),
-    row("gns", "learned", 1e-5, 1e-3), row("shaky", "learned", 3e-5, 2e-4, failures=1), row("dead", "learned", None, 1e-3, failures=3),
-    row("frozen", "trivial", 1e-2, 1e-6), row("oracle", "oracle", 0.0, 1e-5), row("floor", "floor", 3e-7, 2e-3),
+    row("gns", "learned", 1e-5, 1e-3),
+    row("shaky", "learned", 3e-5, 2e-4, failures=1),
+    row("dead", "learned", None, 1e-3, failures=3),
+    row("frozen", "trivial", 1e-2, 1e-6),
+    row("oracle", "oracle", 0.0, 1e-5),
+    row("floor", "floor", 3e-7, 2e-3),
 ]
 
 
@@ -70,9 +81,11 @@ def test_generalisation_shows_every_rollout_medians_and_what_was_trained_on(tmp_
         return row(name, kind, 1e-5, 1e-3, scene=scene) | {"spread": {"per_trajectory": runs}}
 
     rows = [
-        shown("small", "gns", "learned", [1e-4, 2e-4, 3e-4]), shown("small", "frozen", "trivial", [1e-2] * 3),
+        shown("small", "gns", "learned", [1e-4, 2e-4, 3e-4]),
+        shown("small", "frozen", "trivial", [1e-2] * 3),
         shown("small", "floor", "floor", [1e-12] * 3),
-        shown("large", "gns", "learned", [4e-3, None, 6e-3]), shown("large", "frozen", "trivial", [2e-3] * 3),
+        shown("large", "gns", "learned", [4e-3, None, 6e-3]),
+        shown("large", "frozen", "trivial", [2e-3] * 3),
     ]
     figures.generalisation(rows, "particles", {"gns": [(450, 600)]}, tmp_path / "figure.svg")
     above, below = kept[0].axes
@@ -132,8 +145,11 @@ def test_speed_ups_show_every_learned_model_both_ways(tmp_path, kept):
         return {"scene": scene, "contender": name, "equal_error": {"outcome": outcome, "ratio": ratio}, "speed_up_paper": paper}
 
     analysis = [
-        entry("sand", "gns", "loses", 0.1, 2.0), entry("sand", "grid", "wins", 3.0, 9.0), entry("mud", "gns", "worse than trivial", 5.0, 6.0),
-        entry("mud", "dead", "failed", None, 7.0), entry("mud", "alone", "no rung", None, None),
+        entry("sand", "gns", "loses", 0.1, 2.0),
+        entry("sand", "grid", "wins", 3.0, 9.0),
+        entry("mud", "gns", "worse than trivial", 5.0, 6.0),
+        entry("mud", "dead", "failed", None, 7.0),
+        entry("mud", "alone", "no rung", None, None),
     ]
     figures.speed_ups(analysis, tmp_path / "figure.svg")
     (axes,) = kept[0].axes
@@ -144,7 +160,10 @@ def test_speed_ups_show_every_learned_model_both_ways(tmp_path, kept):
     low, high = axes.get_xlim()
     assert low < 0.1 and high > 9 and axes.get_ylim() == (4.6, -0.6)
     assert [text.get_text() for text in kept[0].legends[0].get_texts()] == [
-        "at equal error: wins", "at equal error: loses", "at equal error: worse than trivial", "over the reference, accuracy aside",
+        "at equal error: wins",
+        "at equal error: loses",
+        "at equal error: worse than trivial",
+        "over the reference, accuracy aside",
     ]
 
 

@@ -118,8 +118,10 @@ def batch(frames: int, counts: tuple[int, ...], seed: int, kinds: tuple[int, ...
     total = sum(counts)
     values = torch.randn((frames, len(counts), context), generator=torch.Generator().manual_seed(seed)) if context else None
     return Windows(
-        paths(frames, total, seed), torch.tensor(kinds)[torch.arange(total) % len(kinds)],
-        torch.repeat_interleave(torch.arange(len(counts)), torch.tensor(counts)), values,
+        paths(frames, total, seed),
+        torch.tensor(kinds)[torch.arange(total) % len(kinds)],
+        torch.repeat_interleave(torch.arange(len(counts)), torch.tensor(counts)),
+        values,
     )
 
 
@@ -212,8 +214,14 @@ def start_of(spec: DataSpec, seed: int, particles: int, kinds: tuple[int, ...] =
     kinds = np.array(kinds, np.int8)[np.arange(particles) % len(kinds)]
     position = paths(30, particles, seed).numpy()
     return Start(
-        history=position[:10], particle_type=kinds, present=9, frame_step=spec.frame_step, radius=spec.radius, bounds=np.array(spec.bounds, float),
-        scene={"gravity": spec.gravity}, context=np.random.default_rng(seed).normal(size=(25, context)) if context else None,
+        history=position[:10],
+        particle_type=kinds,
+        present=9,
+        frame_step=spec.frame_step,
+        radius=spec.radius,
+        bounds=np.array(spec.bounds, float),
+        scene={"gravity": spec.gravity},
+        context=np.random.default_rng(seed).normal(size=(25, context)) if context else None,
         kinematic=position[:, kinds == 3] if 3 in kinds else None,
     )
 

@@ -26,8 +26,18 @@ torch.set_num_threads(1)
 
 def spec(dim: int = 2, **changes) -> DataSpec:
     values = dict(
-        dim=dim, bounds=((0.0, 1.0),) * dim, radius=0.2, spacing=0.1, frame_step=0.01, stride=1, gravity=(0.0,) * (dim - 1) + (-9.81,),
-        particle_types=(5,), velocity_mean=(1e-3,) * dim, velocity_std=(1e-2,) * dim, acceleration_mean=(2e-4,) * dim, acceleration_std=(1e-3,) * dim,
+        dim=dim,
+        bounds=((0.0, 1.0),) * dim,
+        radius=0.2,
+        spacing=0.1,
+        frame_step=0.01,
+        stride=1,
+        gravity=(0.0,) * (dim - 1) + (-9.81,),
+        particle_types=(5,),
+        velocity_mean=(1e-3,) * dim,
+        velocity_std=(1e-2,) * dim,
+        acceleration_mean=(2e-4,) * dim,
+        acceleration_std=(1e-3,) * dim,
     )
     return DataSpec(**(values | changes))
 
@@ -154,8 +164,13 @@ def path(frames: int, particles: int = 8, seed: int = 0) -> np.ndarray:
 
 def start(positions: np.ndarray, frames: int, **changes) -> Start:
     values = dict(
-        history=positions[:frames], particle_type=np.full(positions.shape[1], 5, np.int8), present=frames - 1, frame_step=0.01, radius=0.2,
-        bounds=np.array([[0, 1], [0, 1]]), scene={"gravity": [0, -9.81]},
+        history=positions[:frames],
+        particle_type=np.full(positions.shape[1], 5, np.int8),
+        present=frames - 1,
+        frame_step=0.01,
+        radius=0.2,
+        bounds=np.array([[0, 1], [0, 1]]),
+        scene={"gravity": [0, -9.81]},
     )
     return Start(**(values | changes))
 
@@ -226,7 +241,7 @@ class Collapse(nn.Module):
         self.of = (model,)
 
     def forward(self, nodes, edges, graph):
-        model, = self.of
+        (model,) = self.of
         return model.features.target(model._states[0].position, torch.full_like(model._states[0].position[-1], 0.5))
 
 
@@ -238,7 +253,7 @@ class CollapseFirst(nn.Module):
         self.of, self.calls = (model,), []
 
     def forward(self, nodes, edges, graph):
-        model, = self.of
+        (model,) = self.of
         self.calls.append(graph.particles)
         states = model._states if graph.particles == 49 else model._states[1:]
         position = torch.cat([state.position for state in states], 1)
@@ -275,12 +290,15 @@ def test_clumping_ends_a_rollout():
     assert np.isfinite(result.position[0]).all() and np.isnan(result.position[1:]).all()
 
 
-@pytest.mark.parametrize(("changes", "message"), [
-    ({"history": np.zeros((3, 8, 2), np.float32)}, "3 frames, the model needs 6"),
-    ({"history": np.zeros((6, 8, 3), np.float32)}, "3 dimensions"),
-    ({"frame_step": 0.02}, "frame step"),
-    ({"particle_type": np.full(8, 6, np.int8)}, "types \\[6\\]"),
-])
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"history": np.zeros((3, 8, 2), np.float32)}, "3 frames, the model needs 6"),
+        ({"history": np.zeros((6, 8, 3), np.float32)}, "3 dimensions"),
+        ({"frame_step": 0.02}, "frame step"),
+        ({"particle_type": np.full(8, 6, np.int8)}, "types \\[6\\]"),
+    ],
+)
 def test_a_start_of_another_kind_is_refused(changes, message):
     with pytest.raises(ValueError, match=message):
         small().begin(start(path(30), 6, **changes))
@@ -382,16 +400,19 @@ def test_lengths_in_spacings_and_noise_in_units():
     assert small().features.wall_distance == small().radius == 0.2
 
 
-@pytest.mark.parametrize(("name", "settings", "message"), [
-    ("gsn", {}, "known models: .*gns, grid_emulator"),
-    ("gns", {"lattent": 3}, "lattent = 3: unknown; gns has latent"),
-    ("gns", {"latent": -3}, "latent = -3"),
-    ("gns", {"inputs": "positions"}, "inputs"),
-    ("gns", {"unroll": []}, "unroll"),
-    ("gns", {"walls": True}, "ballistic"),
-    ("gns", {"encoder": "absolute", "relative_velocity": True}, "encoder: relative"),
-    ("gns", {"unroll": [1, 0]}, "unroll.1"),
-])
+@pytest.mark.parametrize(
+    ("name", "settings", "message"),
+    [
+        ("gsn", {}, "known models: .*gns, grid_emulator"),
+        ("gns", {"lattent": 3}, "lattent = 3: unknown; gns has latent"),
+        ("gns", {"latent": -3}, "latent = -3"),
+        ("gns", {"inputs": "positions"}, "inputs"),
+        ("gns", {"unroll": []}, "unroll"),
+        ("gns", {"walls": True}, "ballistic"),
+        ("gns", {"encoder": "absolute", "relative_velocity": True}, "encoder: relative"),
+        ("gns", {"unroll": [1, 0]}, "unroll.1"),
+    ],
+)
 def test_bad_settings_are_one_line(name, settings, message):
     with pytest.raises(InputError, match=message) as caught:
         build(name, settings, spec())

@@ -20,8 +20,18 @@ KINDS = torch.full((4,), 5)
 def four(settings: dict | None = None, **changes) -> GNS:
     """A small GNS in float64; connectivity radius .11, spacing .1."""
     values = dict(
-        dim=2, bounds=((0.0, 1.0), (0.0, 1.0)), radius=0.11, spacing=0.1, frame_step=0.01, stride=1, gravity=(0.0, -9.81), particle_types=(5,),
-        velocity_mean=(0.0, 0.0), velocity_std=(1e-2, 1e-2), acceleration_mean=(0.0, 0.0), acceleration_std=(1e-3, 1e-3),
+        dim=2,
+        bounds=((0.0, 1.0), (0.0, 1.0)),
+        radius=0.11,
+        spacing=0.1,
+        frame_step=0.01,
+        stride=1,
+        gravity=(0.0, -9.81),
+        particle_types=(5,),
+        velocity_mean=(0.0, 0.0),
+        velocity_std=(1e-2, 1e-2),
+        acceleration_mean=(0.0, 0.0),
+        acceleration_std=(1e-3, 1e-3),
     )
     torch.manual_seed(0)
     small = {"latent": 16, "hidden_layers": 1, "message_passing": 1, "history": 2}
@@ -42,31 +52,42 @@ def outputs(model: GNS, position: torch.Tensor, kinds: torch.Tensor = KINDS, con
 
 def start(path: torch.Tensor) -> Start:
     return Start(
-        history=path.numpy(), particle_type=np.full(4, 5, np.int8), present=len(path) - 1, frame_step=0.01, radius=0.11,
-        bounds=np.array([[0, 1], [0, 1]]), scene={"gravity": [0, -9.81]},
+        history=path.numpy(),
+        particle_type=np.full(4, 5, np.int8),
+        present=len(path) - 1,
+        frame_step=0.01,
+        radius=0.11,
+        bounds=np.array([[0, 1], [0, 1]]),
+        scene={"gravity": [0, -9.81]},
     )
 
 
 # Node features, edge features, edges, parameters. The plain one: 4 velocity and 4 wall columns; an MLP from n columns to a width of 4 has
 # (n + 1) 4 + 5 * 4 + 8 parameters: 64 (nodes, 8), 44 (edges, 3), 80 (block, 12) and 64 (block, 8), the decoder 5 * 4 + 5 * 2: 282.
-@pytest.mark.parametrize(("settings", "changes", "wanted"), [
-    ({}, {}, (8, 3, 8, 282)),
-    ({"message_passing": 3}, {}, (8, 3, 8, 282 + 2 * 144)),
-    ({"message_passing": 3, "shared": True}, {}, (8, 3, 8, 282)),
-    ({"latent": 8}, {}, (8, 3, 8, 160 + 120 + 288 + 224 + 90)),
-    ({"hidden_layers": 2}, {}, (8, 3, 8, 282 + 5 * 20)),
-    ({"history": 4}, {}, (12, 3, 8, 282 + 4 * 4)),
-    ({"inputs": "last"}, {}, (6, 3, 8, 282 - 2 * 4)),
-    ({"inputs": "acceleration"}, {}, (8, 3, 8, 282)),
-    ({"relative_velocity": True}, {}, (8, 5, 8, 282 + 2 * 4)),
-    ({"encoder": "absolute"}, {}, (10, 0, 8, 282 + 2 * 4 - 44 + 4)),
-    ({"self_edges": False}, {}, (8, 3, 4, 282)),
-    ({"radius": 1.6}, {}, (8, 3, 10, 282)),
-    ({"wall_distance": 4.0, "noise": 0.0, "noise_scheme": "last", "edge_update": False, "ballistic": True, "walls": True, "unroll": [1, 4]}, {},
-     (8, 3, 8, 282)),
-    ({}, {"particle_types": (3, 5)}, (24, 3, 8, 282 + 9 * 16 + 16 * 4)),
-    ({}, {"context_mean": (0.0, 0.0), "context_std": (1.0, 1.0)}, (10, 3, 8, 282 + 2 * 4)),
-])
+@pytest.mark.parametrize(
+    ("settings", "changes", "wanted"),
+    [
+        ({}, {}, (8, 3, 8, 282)),
+        ({"message_passing": 3}, {}, (8, 3, 8, 282 + 2 * 144)),
+        ({"message_passing": 3, "shared": True}, {}, (8, 3, 8, 282)),
+        ({"latent": 8}, {}, (8, 3, 8, 160 + 120 + 288 + 224 + 90)),
+        ({"hidden_layers": 2}, {}, (8, 3, 8, 282 + 5 * 20)),
+        ({"history": 4}, {}, (12, 3, 8, 282 + 4 * 4)),
+        ({"inputs": "last"}, {}, (6, 3, 8, 282 - 2 * 4)),
+        ({"inputs": "acceleration"}, {}, (8, 3, 8, 282)),
+        ({"relative_velocity": True}, {}, (8, 5, 8, 282 + 2 * 4)),
+        ({"encoder": "absolute"}, {}, (10, 0, 8, 282 + 2 * 4 - 44 + 4)),
+        ({"self_edges": False}, {}, (8, 3, 4, 282)),
+        ({"radius": 1.6}, {}, (8, 3, 10, 282)),
+        (
+            {"wall_distance": 4.0, "noise": 0.0, "noise_scheme": "last", "edge_update": False, "ballistic": True, "walls": True, "unroll": [1, 4]},
+            {},
+            (8, 3, 8, 282),
+        ),
+        ({}, {"particle_types": (3, 5)}, (24, 3, 8, 282 + 9 * 16 + 16 * 4)),
+        ({}, {"context_mean": (0.0, 0.0), "context_std": (1.0, 1.0)}, (10, 3, 8, 282 + 2 * 4)),
+    ],
+)
 def test_what_a_setting_adds(settings, changes, wanted):
     model = four({"latent": 4} | settings, **changes)
     position = window(model)
@@ -81,33 +102,41 @@ def test_what_a_setting_adds(settings, changes, wanted):
 ROW, NEXT, ALONE = {0, 1, 2}, [{0, 1}, {0, 1, 2}, {1, 2}], {3}
 
 
-@pytest.mark.parametrize(("settings", "seen"), [
-    ({}, [*NEXT, ALONE]),
-    ({"self_edges": False}, [*NEXT, ALONE]),
-    ({"encoder": "absolute"}, [*NEXT, ALONE]),
-    ({"message_passing": 2}, [ROW, ROW, ROW, ALONE]),
-    ({"message_passing": 2, "shared": True}, [ROW, ROW, ROW, ALONE]),
-    ({"message_passing": 2, "edge_update": False}, [ROW, ROW, ROW, ALONE]),
-    ({"radius": 1.6}, [ROW, ROW, ROW, ALONE]),
-])
+@pytest.mark.parametrize(
+    ("settings", "seen"),
+    [
+        ({}, [*NEXT, ALONE]),
+        ({"self_edges": False}, [*NEXT, ALONE]),
+        ({"encoder": "absolute"}, [*NEXT, ALONE]),
+        ({"message_passing": 2}, [ROW, ROW, ROW, ALONE]),
+        ({"message_passing": 2, "shared": True}, [ROW, ROW, ROW, ALONE]),
+        ({"message_passing": 2, "edge_update": False}, [ROW, ROW, ROW, ALONE]),
+        ({"radius": 1.6}, [ROW, ROW, ROW, ALONE]),
+    ],
+)
 def test_whom_a_particle_sees(settings, seen):
     """The particles whose velocities its acceleration depends on: those within M steps of a radius."""
     model = four(settings)
     position = window(model)[:-1].requires_grad_()
     for particle, wanted in enumerate(seen):
         now = torch.cat([position, window(model)[-1:]])
-        gradient, = torch.autograd.grad(outputs(model, now)[particle].square().sum(), position)
+        (gradient,) = torch.autograd.grad(outputs(model, now)[particle].square().sum(), position)
         assert set(gradient.abs().sum((0, 2)).nonzero().flatten().tolist()) == wanted
 
 
-@pytest.mark.parametrize(("settings", "seen"), [
-    ({"history": 4}, [True] * 5), ({"history": 4, "inputs": "acceleration"}, [True] * 5), ({"history": 1}, [True] * 2),
-    ({"history": 4, "inputs": "last"}, [False, False, False, True, True]),
-])
+@pytest.mark.parametrize(
+    ("settings", "seen"),
+    [
+        ({"history": 4}, [True] * 5),
+        ({"history": 4, "inputs": "acceleration"}, [True] * 5),
+        ({"history": 1}, [True] * 2),
+        ({"history": 4, "inputs": "last"}, [False, False, False, True, True]),
+    ],
+)
 def test_which_frames_are_seen(settings, seen):
     model = four(settings)
     position = window(model).requires_grad_()
-    gradient, = torch.autograd.grad(outputs(model, position).square().sum(), position)
+    (gradient,) = torch.autograd.grad(outputs(model, position).square().sum(), position)
     assert (gradient.abs().sum((1, 2)) > 0).tolist() == seen
 
 
@@ -193,8 +222,11 @@ def test_the_order_of_particles_is_nothing(settings):
     position = windows.position[:3]
     context = torch.ones(40, 1)
     assert torch.allclose(
-        outputs(model, position[:, order], windows.particle_type[order], context), outputs(model, position, windows.particle_type, context)[order],
-        rtol=0, atol=1e-12)
+        outputs(model, position[:, order], windows.particle_type[order], context),
+        outputs(model, position, windows.particle_type, context)[order],
+        rtol=0,
+        atol=1e-12,
+    )
     plain = model.loss(Windows(windows.position[:frames], windows.particle_type, windows.example, windows.context), torch.Generator(), 0.0)
     other = Windows(windows.position[:frames, order], windows.particle_type[order], windows.example, windows.context)
     assert torch.allclose(model.loss(other, torch.Generator(), 0.0), plain, rtol=1e-10)
@@ -222,9 +254,9 @@ def test_the_company_in_a_batch_is_nothing(settings):
         assert torch.allclose(batch[:40], first, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize(("settings", "frames"), [
-    ({"noise": 0.0}, []), ({"noise_scheme": "last"}, [2]), ({"noise_scheme": "correlated"}, [1, 2]), ({}, [1, 2]),
-])
+@pytest.mark.parametrize(
+    ("settings", "frames"), [({"noise": 0.0}, []), ({"noise_scheme": "last"}, [2]), ({"noise_scheme": "correlated"}, [1, 2]), ({}, [1, 2])]
+)
 def test_which_frames_are_noisy(settings, frames, monkeypatch):
     """What the network is given in training, beside the truth; kinematic particles are never moved."""
     model, windows = case({"noise": 0.3} | settings, 1)

@@ -18,8 +18,17 @@ GRAVITY, FRAME_STEP = (0.0, -9.8), 0.0025
 def spec(**changes: object) -> DataSpec:
     """A unit box, particles 1/20 apart (cells of 1/10), statistics of order one spacing."""
     values = {
-        "dim": 2, "bounds": ((0.0, 1.0), (0.0, 1.0)), "radius": 0.1, "spacing": 0.05, "frame_step": FRAME_STEP, "stride": 1, "gravity": GRAVITY,
-        "particle_types": (5,), "velocity_mean": (0.0, 0.0), "velocity_std": (4e-3, 4e-3), "acceleration_mean": (0.0, 0.0),
+        "dim": 2,
+        "bounds": ((0.0, 1.0), (0.0, 1.0)),
+        "radius": 0.1,
+        "spacing": 0.05,
+        "frame_step": FRAME_STEP,
+        "stride": 1,
+        "gravity": GRAVITY,
+        "particle_types": (5,),
+        "velocity_mean": (0.0, 0.0),
+        "velocity_std": (4e-3, 4e-3),
+        "acceleration_mean": (0.0, 0.0),
         "acceleration_std": (2e-4, 2e-4),
     }
     return DataSpec(**{**values, **changes})
@@ -48,8 +57,13 @@ def flight(particles: int, frames: int, dim: int = 2, seed: int = 0, gravity: tu
 def start(position: np.ndarray, **changes: object) -> Start:
     dim = position.shape[2]
     values = {
-        "history": position, "particle_type": np.full(position.shape[1], 5, np.int8), "present": len(position) - 1, "frame_step": FRAME_STEP,
-        "radius": 0.1, "bounds": np.array([[0.0, 1.0]] * dim), "scene": {"gravity": list(GRAVITY)},
+        "history": position,
+        "particle_type": np.full(position.shape[1], 5, np.int8),
+        "present": len(position) - 1,
+        "frame_step": FRAME_STEP,
+        "radius": 0.1,
+        "bounds": np.array([[0.0, 1.0]] * dim),
+        "scene": {"gravity": list(GRAVITY)},
     }
     return Start(**{**values, **changes})
 
@@ -127,9 +141,13 @@ def test_coarser_levels_hold_the_parents() -> None:
 @pytest.mark.parametrize("dim", [2, 3])
 def test_untrained_model_flies_ballistically(dim: int) -> None:
     gravity = (*GRAVITY, 0.0)[:dim]
-    model = emulator({"history": 3, "preview": []}, dim=dim, bounds=((0.0, 1.0),) * dim, gravity=gravity, **{
-        name: (1e-3,) * dim for name in ("velocity_mean", "velocity_std", "acceleration_mean", "acceleration_std")
-    })
+    model = emulator(
+        {"history": 3, "preview": []},
+        dim=dim,
+        bounds=((0.0, 1.0),) * dim,
+        gravity=gravity,
+        **{name: (1e-3,) * dim for name in ("velocity_mean", "velocity_std", "acceleration_mean", "acceleration_std")},
+    )
     truth = flight(40, 23, dim, gravity=gravity)
     found = rollout(model, start(truth[:3]), 20)
     assert found.status == "ok"

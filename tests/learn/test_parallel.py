@@ -45,6 +45,7 @@ def write_config(path: Path, settings: dict, **training: object) -> Path:
 @pytest.fixture(scope="module")
 def uneven(tmp_path_factory: pytest.TempPathFactory, write_dataset) -> Path:
     """Trajectories of different numbers of particles, a third of them kinematic in some."""
+
     def draw(seed: int):
         found = bounce(seed, particles=12 + 5 * (seed % 3), frames=12)
         found.particle_type[: 4 * (seed % 2)] = 3

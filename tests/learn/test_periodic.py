@@ -33,8 +33,19 @@ SCENE = {"name": "channel", "periodic": ["x"], "spacing": 0.4, "gravity": [0.0, 
 
 def spec(**changes) -> DataSpec:
     values = dict(
-        dim=2, bounds=BOUNDS.tolist(), radius=0.5, spacing=0.4, frame_step=0.1, stride=1, gravity=(0.0, 0.0), particle_types=(5,),
-        velocity_mean=(0.0, 0.0), velocity_std=(0.1, 0.1), acceleration_mean=(0.0, 0.0), acceleration_std=(0.01, 0.01), periodic=("x",),
+        dim=2,
+        bounds=BOUNDS.tolist(),
+        radius=0.5,
+        spacing=0.4,
+        frame_step=0.1,
+        stride=1,
+        gravity=(0.0, 0.0),
+        particle_types=(5,),
+        velocity_mean=(0.0, 0.0),
+        velocity_std=(0.1, 0.1),
+        acceleration_mean=(0.0, 0.0),
+        acceleration_std=(0.01, 0.01),
+        periodic=("x",),
     )
     return DataSpec(**(values | changes))
 
@@ -68,8 +79,13 @@ def test_edges_by_hand():
 
 
 @settings(max_examples=60, deadline=None)
-@given(seed=st.integers(0, 2**31), count=st.integers(1, 40), radius=st.floats(0.05, 4.0), examples=st.integers(1, 3),
-       axes=st.sampled_from(["x", "y", "xy", "xyz", "xz"]))
+@given(
+    seed=st.integers(0, 2**31),
+    count=st.integers(1, 40),
+    radius=st.floats(0.05, 4.0),
+    examples=st.integers(1, 3),
+    axes=st.sampled_from(["x", "y", "xy", "xyz", "xz"]),
+)
 def test_graph_against_brute_force(seed, count, radius, examples, axes):
     """Points in any of their images; radii above half the box as well: a pair joins once, by its nearest images."""
     generator = np.random.default_rng(seed)

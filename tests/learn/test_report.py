@@ -42,8 +42,13 @@ def make_rows(kinematic=True) -> list[dict]:
     """Rows as the comparison makes them, with times and costs set by hand."""
     truths = [trajectory(seed, kinematic) for seed in range(3)]
     contenders = [
-        Off("gns", "learned", truths, 0.02), Off("dead", "learned", truths, 0.0, fails_at=8), Off("rung", "solver", truths, 0.01),
-        Off("teacher", "reference", truths, 0.0), Frozen(), Oracle(truths), Off("floor", "floor", truths, 1e-3),
+        Off("gns", "learned", truths, 0.02),
+        Off("dead", "learned", truths, 0.0, fails_at=8),
+        Off("rung", "solver", truths, 0.01),
+        Off("teacher", "reference", truths, 0.0),
+        Frozen(),
+        Oracle(truths),
+        Off("floor", "floor", truths, 1e-3),
     ]
     rows = compare.compare(contenders, truths, compare.CompareSettings(horizons=(1, 5, 100), one_step_samples=2, curve_points=5))
     seconds = {"gns": 3e-3, "dead": 3e-3, "rung": 1e-3, "teacher": 9e-3}
@@ -67,8 +72,10 @@ def assets(tmp_path):
     asset = report.Asset
     return {
         "hand": report.SceneAssets(
-            films=[asset(tmp_path / "film.mp4", "solver, model, error", tmp_path / "poster.png")], stills=[asset(tmp_path / "poster.png", "the end")],
-            main=[asset(tmp_path / "figure.svg", 'error "over" <run time>')], figures=[asset(tmp_path / "figure.svg", "over time", wide=True)],
+            films=[asset(tmp_path / "film.mp4", "solver, model, error", tmp_path / "poster.png")],
+            stills=[asset(tmp_path / "poster.png", "the end")],
+            main=[asset(tmp_path / "figure.svg", 'error "over" <run time>')],
+            figures=[asset(tmp_path / "figure.svg", "over time", wide=True)],
             training=[asset(tmp_path / "curve.png", "loss")],
         )
     }
@@ -298,9 +305,7 @@ def test_text_is_escaped(tmp_path, rows):
         assert "<b>" not in text and "<script>" not in text
 
 
-@pytest.mark.parametrize(
-    ("summary", "match"), [({"rows": [], "verdict": "v"}, "at least one row"), ({"rows": [{}]}, "begins with its verdict")],
-)
+@pytest.mark.parametrize(("summary", "match"), [({"rows": [], "verdict": "v"}, "at least one row"), ({"rows": [{}]}, "begins with its verdict")])
 def test_incomplete_summaries_are_refused(tmp_path, summary, match):
     with pytest.raises(InputError, match=match):
         report.write_report(summary, tmp_path / "report.html")
@@ -323,7 +328,7 @@ def test_numbers_have_two_digits(value, text):
 
 
 @pytest.mark.parametrize(
-    ("value", "text"), [(2e-6, "2 µs"), (8.4e-4, "840 µs"), (0.0123, "12.3 ms"), (7.0, "7 s"), (450.0, "7.5 min"), (11160.0, "3.1 h")],
+    ("value", "text"), [(2e-6, "2 µs"), (8.4e-4, "840 µs"), (0.0123, "12.3 ms"), (7.0, "7 s"), (450.0, "7.5 min"), (11160.0, "3.1 h")]
 )
 def test_durations_have_units(value, text):
     assert report.duration(value) == text

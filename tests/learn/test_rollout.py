@@ -99,6 +99,7 @@ def test_a_rollout_goes_on_beyond_the_truth(dummy: Path, bounce_dataset: Path, t
 
 def test_what_leaves_the_box_is_said(dummy: Path, bounce_dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch) -> None:
     """All particles go on at 0.04 a frame: those 0.3 or more from the wall at 0.9 need more than 7 frames to be a radius (0.1) beyond it."""
+
     def fly(self) -> np.ndarray:
         self.state = torch.stack([self.state[1], self.state[1] + torch.tensor([0.04, 0.0])])
         return self.state[1:].numpy().copy()

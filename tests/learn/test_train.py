@@ -122,9 +122,12 @@ def slow(self, *arguments):
 dummy_model.Dummy.loss = slow
 """
 
-CHILD = SLOW + """
+CHILD = (
+    SLOW
+    + """
 Trainer(Config.model_validate_json({config!r}), {data!r}, {run!r}).run()
 """
+)
 
 
 def test_killed_and_resumed_is_bitwise_unbroken(unbroken: Path, bounce_dataset: Path, tmp_path: Path) -> None:
@@ -153,7 +156,9 @@ def test_killed_and_resumed_is_bitwise_unbroken(unbroken: Path, bounce_dataset: 
     assert_same_run(run, unbroken)
 
 
-FORKS = SLOW + """
+FORKS = (
+    SLOW
+    + """
 instants = random.Random({seed})
 killed = 0
 while killed < {kills}:
@@ -170,6 +175,7 @@ while killed < {kills}:
         break
 print(killed)
 """
+)
 
 
 def test_killed_at_twenty_random_instants(unbroken: Path, bounce_dataset: Path, tmp_path: Path) -> None:
@@ -413,16 +419,29 @@ def test_load_config(tmp_path: Path) -> None:
     assert load_config(write(tmp_path / "c.yaml", "model: gns\ntraining: {steps: 5, learning_rate: 1e-3}\n")).training.learning_rate == 1e-3
 
 
-@pytest.mark.parametrize(("content", "key"), [
-    ("", "file"), ("- 1", "file"), ("a: [", "line 1"), ("\x00", "file"), ("[" * 400, "line 1"), ({**GOOD, "modle": "x"}, "modle"),
-    ({"model": "dummy"}, "training"), ({**GOOD, "training": {}}, "exactly one of steps and minutes"),
-    ({**GOOD, "training": {"steps": 1, "minutes": 1}}, "exactly one"), ({**GOOD, "training": {"steps": 0}}, r"training\.steps = 0"),
-    ({**GOOD, "training": {"steps": 1, "lr": 1}}, r"training\.lr"), ({**GOOD, "training": {"minutes": float("nan")}}, r"training\.minutes"),
-    ({**GOOD, "training": {"steps": 1, "learning_rate": "fast"}}, r"training\.learning_rate = 'fast'"),
-    ({**GOOD, "training": {"steps": 1, "final_learning_rate": 1}}, "final_learning_rate"), ({**GOOD, "data": {"stride": 0}}, r"data\.stride"),
-    ({**GOOD, "training": 3}, "training"), ({**GOOD, "settings": [1]}, "settings"),
-    ("a: &a [x, x, x, x, x, x]\nb: &b [*a, *a, *a, *a, *a]\ntraining: [*b, *b, *b]\nmodel: m", "training"),
-])
+@pytest.mark.parametrize(
+    ("content", "key"),
+    [
+        ("", "file"),
+        ("- 1", "file"),
+        ("a: [", "line 1"),
+        ("\x00", "file"),
+        ("[" * 400, "line 1"),
+        ({**GOOD, "modle": "x"}, "modle"),
+        ({"model": "dummy"}, "training"),
+        ({**GOOD, "training": {}}, "exactly one of steps and minutes"),
+        ({**GOOD, "training": {"steps": 1, "minutes": 1}}, "exactly one"),
+        ({**GOOD, "training": {"steps": 0}}, r"training\.steps = 0"),
+        ({**GOOD, "training": {"steps": 1, "lr": 1}}, r"training\.lr"),
+        ({**GOOD, "training": {"minutes": float("nan")}}, r"training\.minutes"),
+        ({**GOOD, "training": {"steps": 1, "learning_rate": "fast"}}, r"training\.learning_rate = 'fast'"),
+        ({**GOOD, "training": {"steps": 1, "final_learning_rate": 1}}, "final_learning_rate"),
+        ({**GOOD, "data": {"stride": 0}}, r"data\.stride"),
+        ({**GOOD, "training": 3}, "training"),
+        ({**GOOD, "settings": [1]}, "settings"),
+        ("a: &a [x, x, x, x, x, x]\nb: &b [*a, *a, *a, *a, *a]\ntraining: [*b, *b, *b]\nmodel: m", "training"),
+    ],
+)
 def test_bad_configurations(tmp_path: Path, bounce_dataset: Path, content: object, key: str, capsys: pytest.CaptureFixture) -> None:
     path = write(tmp_path / "c.yaml", content)
     with pytest.raises(InputError, match=rf"c\.yaml: .*{key}"):
@@ -431,11 +450,18 @@ def test_bad_configurations(tmp_path: Path, bounce_dataset: Path, content: objec
     assert len(capsys.readouterr().err.splitlines()) == 1 and not (tmp_path / "run").exists()
 
 
-@pytest.mark.parametrize(("content", "key"), [
-    ({**GOOD, "model": "gsn"}, "model = 'gsn'"), ({**GOOD, "settings": {"nose": 1}}, "nose"), ({**GOOD, "settings": {"noise": -1}}, "noise"),
-    ({**GOOD, "data": {"stride": 30}}, "stride"), ({**GOOD, "training": {"steps": 5, "batch": 10**6}}, "batch"),
-    ({**GOOD, "data": {"skip_rest": 1e9}}, "skip_rest"), ({**GOOD, "training": {"steps": 5, "tensorboard": True}}, "tensorboard is missing"),
-])
+@pytest.mark.parametrize(
+    ("content", "key"),
+    [
+        ({**GOOD, "model": "gsn"}, "model = 'gsn'"),
+        ({**GOOD, "settings": {"nose": 1}}, "nose"),
+        ({**GOOD, "settings": {"noise": -1}}, "noise"),
+        ({**GOOD, "data": {"stride": 30}}, "stride"),
+        ({**GOOD, "training": {"steps": 5, "batch": 10**6}}, "batch"),
+        ({**GOOD, "data": {"skip_rest": 1e9}}, "skip_rest"),
+        ({**GOOD, "training": {"steps": 5, "tensorboard": True}}, "tensorboard is missing"),
+    ],
+)
 def test_configurations_that_do_not_fit(
     tmp_path: Path, bounce_dataset: Path, content: dict, key: str, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -489,10 +515,12 @@ def test_command_line_mistakes(unbroken: Path, bounce_dataset: Path, tmp_path: P
     checkpoint, data, out = str(unbroken / "best.pt"), ["--data", str(bounce_dataset)], tmp_path / "o.h5"
     (tmp_path / "taken.h5").touch()
     for arguments in (
-        ["rollout", checkpoint, *data, "--split", "nowhere", "--out", str(out)], ["rollout", checkpoint, *data, "--count", "9", "--out", str(out)],
+        ["rollout", checkpoint, *data, "--split", "nowhere", "--out", str(out)],
+        ["rollout", checkpoint, *data, "--count", "9", "--out", str(out)],
         ["rollout", str(bounce_dataset / "dataset.json"), *data, "--out", str(out)],
         ["rollout", checkpoint, "--data", str(tmp_path), "--out", str(out)],
-        ["rollout", checkpoint, *data, "--out", str(tmp_path / "taken.h5")], ["info", str(tmp_path / "none.pt")],
+        ["rollout", checkpoint, *data, "--out", str(tmp_path / "taken.h5")],
+        ["info", str(tmp_path / "none.pt")],
         ["train", str(tmp_path / "none.yaml"), *data, "--out", str(out)],
         ["train", str(write(tmp_path / "c.yaml", GOOD)), *data, "--out", str(tmp_path / "taken.h5")],
     ):

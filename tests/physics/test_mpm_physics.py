@@ -18,8 +18,18 @@ def scene(material, bodies, **changes):
     """A resolved 2D scene in a unit box of 32 x 32 cells, four particles a cell."""
     bodies = [{"material": "stuff", "velocity": [0.0, 0.0]} | body for body in bodies]
     content = {
-        "name": "physics", "dim": 2, "bounds": [[0.0, 1.0], [0.0, 1.0]], "gravity": [0.0, -G], "frame_step": 0.005, "frames": 100,
-        "radius": 0.05, "cells": [32, 32], "materials": {"stuff": material}, "seed": 1, "jitter": 0.2, "bodies": bodies,
+        "name": "physics",
+        "dim": 2,
+        "bounds": [[0.0, 1.0], [0.0, 1.0]],
+        "gravity": [0.0, -G],
+        "frame_step": 0.005,
+        "frames": 100,
+        "radius": 0.05,
+        "cells": [32, 32],
+        "materials": {"stuff": material},
+        "seed": 1,
+        "jitter": 0.2,
+        "bodies": bodies,
     }
     return Scene.from_dict(content | changes)
 

@@ -18,9 +18,19 @@ def scene(bodies, spacing, counts, density=500.0, **changes):
     bodies = [{"material": name, "kind": "box", "lower": [spacing * each for each in lower], "upper": [spacing * each for each in upper],
                "velocity": (velocity or [[0.0] * dim])[0]} for name, lower, upper, *velocity in bodies]  # fmt: skip
     content = {
-        "name": "test", "dim": dim, "bounds": [[0.0, spacing * count] for count in counts], "gravity": [0.0, -G, 0.0][:dim], "frame_step": 1 / 60,
-        "frames": 121, "radius": 1.5 * spacing, "cells": list(counts), "particles_per_cell": 1, "solver": {"method": "pbf"}, "seed": 1,
-        "materials": {"water": {"model": "water"}, "cube": {"model": "rigid", "density": density}}, "bodies": bodies,
+        "name": "test",
+        "dim": dim,
+        "bounds": [[0.0, spacing * count] for count in counts],
+        "gravity": [0.0, -G, 0.0][:dim],
+        "frame_step": 1 / 60,
+        "frames": 121,
+        "radius": 1.5 * spacing,
+        "cells": list(counts),
+        "particles_per_cell": 1,
+        "solver": {"method": "pbf"},
+        "seed": 1,
+        "materials": {"water": {"model": "water"}, "cube": {"model": "rigid", "density": density}},
+        "bodies": bodies,
     }
     return Scene.from_dict(content | changes)
 

@@ -59,12 +59,21 @@ def test_a_light_cube_floats_at_its_draft_in_3d():
     water = [([0, 0, 0], [width, bottom, width]), ([0, bottom, 0], [low, depth, width]), ([high, bottom, 0], [width, depth, width]),
              ([low, bottom, 0], [high, depth, low]), ([low, bottom, high], [high, depth, width])]  # fmt: skip
     bodies = [("water", *corners) for corners in water] + [("cube", [low, bottom, low], [high, bottom + height, high])]
-    scene = Scene.model_validate({
-        "name": "pool", "dim": 3, "bounds": [[0.0, width], [0.0, 1.0], [0.0, width]], "gravity": [0.0, -9.8, 0.0], "frame_step": 0.01, "frames": 201,
-        "radius": 0.1, "cells": [12, 16, 12], "seed": 3,
-        "bodies": [{"material": name, "kind": "box", "lower": lower, "upper": upper, "velocity": [0.0] * 3} for name, lower, upper in bodies],
-        "materials": {"water": {"model": "water", "sound_speed": 15.0}, "cube": {"model": "rigid", "density": 500.0}},
-    })
+    scene = Scene.model_validate(
+        {
+            "name": "pool",
+            "dim": 3,
+            "bounds": [[0.0, width], [0.0, 1.0], [0.0, width]],
+            "gravity": [0.0, -9.8, 0.0],
+            "frame_step": 0.01,
+            "frames": 201,
+            "radius": 0.1,
+            "cells": [12, 16, 12],
+            "seed": 3,
+            "bodies": [{"material": name, "kind": "box", "lower": lower, "upper": upper, "velocity": [0.0] * 3} for name, lower, upper in bodies],
+            "materials": {"water": {"model": "water", "sound_speed": 15.0}, "cube": {"model": "rigid", "density": 500.0}},
+        }
+    )
     simulator, shares, cube = MPMSimulator(), [], scene.particles().material == 1
     simulator.load(scene)
     for frame in range(200):

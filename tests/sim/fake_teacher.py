@@ -78,7 +78,12 @@ class Broken(FakeTeacher):
 
 #: What ``poisoned`` does to which trajectories of a training split: field of the solver's kernels, content of one of its particles.
 POISONS = {
-    1: ("velocity", np.nan), 2: ("velocity", -np.inf), 3: ("strain", np.nan), 5: ("position", np.nan), 6: ("position", -7.0), 7: ("position", 1e9),
+    1: ("velocity", np.nan),
+    2: ("velocity", -np.inf),
+    3: ("strain", np.nan),
+    5: ("position", np.nan),
+    6: ("position", -7.0),
+    7: ("position", 1e9),
 }
 #: The frame before which it happens, and the particle of the field.
 POISON_FRAME, POISON_PARTICLE = 4, 17

@@ -93,8 +93,12 @@ def test_generate_options(scene, tmp_path):
 
 @pytest.mark.parametrize(
     ("change", "options", "message"),
-    [({"colour": 1}, [], "tiny.yaml: colour = 1: unknown key"), ({}, ["--variant", "heavy"], "variant = 'heavy'"), ({}, ["--count", "3"], "--split"),
-     ({"radius": 0.01}, [], "radius = 0.01: below the particle spacing")],
+    [
+        ({"colour": 1}, [], "tiny.yaml: colour = 1: unknown key"),
+        ({}, ["--variant", "heavy"], "variant = 'heavy'"),
+        ({}, ["--count", "3"], "--split"),
+        ({"radius": 0.01}, [], "radius = 0.01: below the particle spacing"),
+    ],
 )
 def test_mistakes_exit_with_2_and_write_nothing(scene, tmp_path, capsys, change, options, message):
     scene.write_text(json.dumps(json.loads(scene.read_text()) | change))

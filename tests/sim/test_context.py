@@ -16,8 +16,15 @@ from sim.trajectory import ShardReader
 
 EPS = float(np.finfo(np.float32).eps)
 BASE = {
-    "name": "shaken", "dim": 2, "bounds": [[0.0, 1.0], [0.0, 1.0]], "gravity": [0.0, -9.8], "frame_step": 0.01, "frames": 12, "radius": 0.1,
-    "cells": [16, 16], "materials": {"sand": {"model": "sand", "young_modulus": 1e5, "friction_angle": 35.0}},
+    "name": "shaken",
+    "dim": 2,
+    "bounds": [[0.0, 1.0], [0.0, 1.0]],
+    "gravity": [0.0, -9.8],
+    "frame_step": 0.01,
+    "frames": 12,
+    "radius": 0.1,
+    "cells": [16, 16],
+    "materials": {"sand": {"model": "sand", "young_modulus": 1e5, "friction_angle": 35.0}},
     "bodies": [{"material": "sand", "shape": {"kind": "box", "size": [0.25, 0.25]}}],
     "splits": {"train": 6, "valid": 2, "test": 2},
 }
@@ -36,8 +43,9 @@ def sand(**changes):
 
 
 def test_acceleration_is_the_mean_over_each_frame():
-    motion = Container(sines=[{"amplitude": [3.0, -1.0], "frequency": 1.7, "phase": 30.0},
-                              {"amplitude": [0.5, 2.0], "frequency": 9.0, "phase": 200.0}])
+    motion = Container(
+        sines=[{"amplitude": [3.0, -1.0], "frequency": 1.7, "phase": 30.0}, {"amplitude": [0.5, 2.0], "frequency": 9.0, "phase": 200.0}]
+    )
     found, step = motion.acceleration(20, 0.01), 0.01
 
     def a(t, axis):
@@ -69,11 +77,22 @@ def test_a_box_shaken_at_10_g_equals_a_moving_frame(dim):
     """
     directions = [[98.0, -30.0, 20.0][:dim], [-10.0, 70.0, 5.0][:dim]]
     motion = {"sines": [{"amplitude": directions[0], "frequency": 8.0, "phase": 90.0}, {"amplitude": directions[1], "frequency": 5.0, "phase": 10.0}]}
-    scene = Scene.from_dict({
-        "name": "lone", "dim": dim, "bounds": [[0.0, 1.0]] * dim, "gravity": [0.0] * (dim - 1) + [-9.8], "frame_step": 0.005, "frames": 60,
-        "radius": 0.1, "cells": [16] * dim, "materials": {"water": {"model": "water", "sound_speed": 10.0}}, "seed": 3,
-        "bodies": [{"material": "water", "kind": "box", "lower": [0.5] * dim, "upper": [0.52] * dim, "velocity": [0.3] * dim}], "container": motion,
-    })
+    scene = Scene.from_dict(
+        {
+            "name": "lone",
+            "dim": dim,
+            "bounds": [[0.0, 1.0]] * dim,
+            "gravity": [0.0] * (dim - 1) + [-9.8],
+            "frame_step": 0.005,
+            "frames": 60,
+            "radius": 0.1,
+            "cells": [16] * dim,
+            "materials": {"water": {"model": "water", "sound_speed": 10.0}},
+            "seed": 3,
+            "bodies": [{"material": "water", "kind": "box", "lower": [0.5] * dim, "upper": [0.52] * dim, "velocity": [0.3] * dim}],
+            "container": motion,
+        }
+    )
     simulator = MPMSimulator()
     simulator.load(scene)
     acceleration, ground = scene.acceleration(), np.array(scene.gravity)
@@ -133,8 +152,9 @@ def test_numbers_are_drawn_by_split():
 
 
 def test_one_range_serves_all_splits():
-    some = family(materials=sand(friction_angle=[20, 40], young_modulus=[[1e5, 2e5], [5e5, 6e5]]),
-                  context=["sand.young_modulus", "sand.friction_angle"])
+    some = family(
+        materials=sand(friction_angle=[20, 40], young_modulus=[[1e5, 2e5], [5e5, 6e5]]), context=["sand.young_modulus", "sand.friction_angle"]
+    )
     scene = some.sample(1)
     assert some.sample(1, "test").materials == scene.materials
     numbers = scene.materials["sand"]

@@ -41,8 +41,13 @@ def trajectory(position, kinds=None, **changes):
     position = np.asarray(position, np.float32)
     frames, particles, dim = position.shape
     fields = {
-        "position": position, "particle_type": np.full(particles, 5, np.int8) if kinds is None else np.asarray(kinds, np.int8), "frame_step": 0.0025,
-        "radius": 0.1, "bounds": np.array([[0.1, 0.9]] * dim), "scene": {"name": "made up", "spacing": 0.05}, "seed": 1,
+        "position": position,
+        "particle_type": np.full(particles, 5, np.int8) if kinds is None else np.asarray(kinds, np.int8),
+        "frame_step": 0.0025,
+        "radius": 0.1,
+        "bounds": np.array([[0.1, 0.9]] * dim),
+        "scene": {"name": "made up", "spacing": 0.05},
+        "seed": 1,
         "simulator": {"name": "none"},
     }
     return Trajectory(**(fields | changes))
@@ -192,8 +197,11 @@ def test_positions_keep_their_bits_in_every_format(made):
                 change(data, "statistics", name, value=[0.0] * made[0].position.shape[2])
         for name in FORMATS:
             export(data, folder / name, name)
-        learners = [read_geoelements(folder / "geoelements", "train"), read_deepmind(folder / "deepmind", "train"),
-                    read_lagrangebench(folder / "lagrangebench", "train")]
+        learners = [
+            read_geoelements(folder / "geoelements", "train"),
+            read_deepmind(folder / "deepmind", "train"),
+            read_lagrangebench(folder / "lagrangebench", "train"),
+        ]
         for found, kinds_of in zip(learners, (np.int64, np.int64, np.int32), strict=True):
             assert len(found) == len(made)
             for (position, kinds, *context), run in zip(found, made, strict=True):
@@ -276,14 +284,28 @@ def test_metadata_by_hand(tmp_path):
     made = {"train": {0: trajectory(np.concatenate([position, wall], axis=1), [5, 3, 3])}, "test": {0: trajectory(100 * position, [5, 3])}}
     data = write_data(tmp_path / "data", made)
     common = {
-        "bounds": [[0.1, 0.9], [0.1, 0.9]], "default_connectivity_radius": 0.1, "dim": 2, "dt": 0.0025,
-        "vel_mean": [1.5, 0.0], "vel_std": [0.5, 0.0], "acc_mean": [1.0, 0.0], "acc_std": [0.0, 0.0],
+        "bounds": [[0.1, 0.9], [0.1, 0.9]],
+        "default_connectivity_radius": 0.1,
+        "dim": 2,
+        "dt": 0.0025,
+        "vel_mean": [1.5, 0.0],
+        "vel_std": [0.5, 0.0],
+        "acc_mean": [1.0, 0.0],
+        "acc_std": [0.0, 0.0],
     }
     additions = {
-        "geoelements": {"sequence_length": 3}, "deepmind": {"sequence_length": 2},
+        "geoelements": {"sequence_length": 3},
+        "deepmind": {"sequence_length": 2},
         "lagrangebench": {
-            "sequence_length": 3, "sequence_length_train": 3, "sequence_length_test": 3, "num_trajs_train": 1, "num_trajs_test": 1, "dx": 0.05,
-            "write_every": 1, "num_particles_max": 3, "periodic_boundary_conditions": [False, False, False],
+            "sequence_length": 3,
+            "sequence_length_train": 3,
+            "sequence_length_test": 3,
+            "num_trajs_train": 1,
+            "num_trajs_test": 1,
+            "dx": 0.05,
+            "write_every": 1,
+            "num_particles_max": 3,
+            "periodic_boundary_conditions": [False, False, False],
         },
     }
     for name, special in additions.items():
@@ -441,9 +463,7 @@ def test_layout_of_a_data_set(data, tmp_path):
     assert done.trajectories == {"train": 5, "valid": 2, "test": 1} and done.failed == [("train", 1, "failed: too fast (frame 3)")]
 
 
-@pytest.mark.parametrize(
-    ("text", "wanted"), [("::3", [0, 3, 6]), ("2:4", [2, 3]), ("5", [5]), ("-1", [7]), ("6:", [6, 7]), ("0", [0])]
-)
+@pytest.mark.parametrize(("text", "wanted"), [("::3", [0, 3, 6]), ("2:4", [2, 3]), ("5", [5]), ("-1", [7]), ("6:", [6, 7]), ("0", [0])])
 def test_frames(data, tmp_path, text, wanted):
     export(data, tmp_path / "ply", "ply", split="test", frames=text)
     assert sorted(path.name for path in (tmp_path / "ply/test/000000").iterdir()) == [f"frame-{frame:05d}.ply" for frame in wanted]

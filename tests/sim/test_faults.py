@@ -30,7 +30,13 @@ from sim.trajectory import ShardReader, write_shard  # noqa: E402
 
 #: Water and sand thrown at a ball on the floor.
 MIXED = {
-    "name": "mixed", "dim": 2, "bounds": [[0.0, 1.0], [0.0, 1.0]], "gravity": [0.0, -9.8], "frame_step": 0.005, "frames": 81, "radius": 0.08,
+    "name": "mixed",
+    "dim": 2,
+    "bounds": [[0.0, 1.0], [0.0, 1.0]],
+    "gravity": [0.0, -9.8],
+    "frame_step": 0.005,
+    "frames": 81,
+    "radius": 0.08,
     "cells": [32, 32],
     "materials": {"water": {"model": "water", "sound_speed": 12.0}, "sand": {"model": "sand", "young_modulus": 1e5, "friction_angle": 35.0}},
     "bodies": [
@@ -42,7 +48,13 @@ MIXED = {
 }
 #: The same without the ball, in a cube.
 CUBE = {
-    "dim": 3, "bounds": [[0.0, 1.0]] * 3, "gravity": [0.0, -9.8, 0.0], "frames": 9, "cells": [12, 12, 12], "radius": 0.2, "obstacles": [],
+    "dim": 3,
+    "bounds": [[0.0, 1.0]] * 3,
+    "gravity": [0.0, -9.8, 0.0],
+    "frames": 9,
+    "cells": [12, 12, 12],
+    "radius": 0.2,
+    "obstacles": [],
     "bodies": [
         {"material": "water", "shape": {"kind": "box", "size": [0.4, 0.3, 0.3]}, "velocity": [[-1.0, 1.0], [-1.0, 0.0], 0.0]},
         {"material": "sand", "shape": {"kind": "box", "size": [0.3, 0.3, 0.3]}, "velocity": [[-1.0, 1.0], [-1.0, 0.0], 0.0]},

@@ -58,7 +58,11 @@ def start_slow(folder, jobs=2):
     environment = os.environ | {"PYTHONPATH": f"{HERE}:{HERE.parent.parent}"}
     # A shell ignores SIGINT in what it runs in the background, and children inherit that.
     return subprocess.Popen(
-        [sys.executable, "-c", code, *arguments], env=environment, stderr=subprocess.PIPE, text=True, start_new_session=True,
+        [sys.executable, "-c", code, *arguments],
+        env=environment,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     )
 
@@ -251,8 +255,13 @@ def test_nothing_is_written_for_a_scene_that_cannot_be_sampled(tmp_path):
 
 @pytest.mark.parametrize(
     ("changes", "options", "key"),
-    [({"frames": 13}, {}, "family.frames"), ({"gravity": [0.0, -5.0]}, {}, "family.gravity"), ({}, {"seed": 1}, "seed"),
-     ({}, {"shard_size": 3}, "shard_size"), ({"materials": {"water": {"model": "water", "sound_speed": 6.0}}}, {}, "sound_speed")],
+    [
+        ({"frames": 13}, {}, "family.frames"),
+        ({"gravity": [0.0, -5.0]}, {}, "family.gravity"),
+        ({}, {"seed": 1}, "seed"),
+        ({}, {"shard_size": 3}, "shard_size"),
+        ({"materials": {"water": {"model": "water", "sound_speed": 6.0}}}, {}, "sound_speed"),
+    ],
 )
 def test_a_folder_made_with_other_settings_is_refused(reference, changes, options, key):
     before = {path: path.stat().st_mtime_ns for path in reference.rglob("*")}

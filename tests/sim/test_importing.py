@@ -99,7 +99,11 @@ def test_what_others_wrote(tmp_path, format):
     done = take(folder, tmp_path / "out", format)
     assert done.trajectories == {"train": 10, "test": 1} and done.spacing_from == "given"
     assert sorted(str(path.relative_to(tmp_path / "out")) for path in (tmp_path / "out").rglob("*.*")) == [
-        "dataset.json", "test/shard-00000.h5", "train/shard-00000.h5", "train/shard-00001.h5"]
+        "dataset.json",
+        "test/shard-00000.h5",
+        "train/shard-00000.h5",
+        "train/shard-00001.h5",
+    ]
     for run, (position, kinds) in zip(read(tmp_path / "out") + read(tmp_path / "out", "test"), runs, strict=True):
         same_bits(run.position, position)
         same_bits(run.particle_type, kinds.astype(np.int8))
@@ -235,8 +239,10 @@ def test_exports_come_back(tmp_path, format, dim):
         write_shard(data / split / "shard-00000.h5", dict(enumerate(members)))
         entries[split] = {"trajectories": len(members), "ok": len(members), "failed": [], "shards": [f"{split}/shard-00000.h5"]}
     statistics = training_statistics([data / "train/shard-00000.h5"])
-    write_json(data / "dataset.json", {"format_version": 1, "scene": "ours", "family": {}, "seed": 1, "shard_size": 9, "splits": entries,
-                                       "statistics": statistics})
+    write_json(
+        data / "dataset.json",
+        {"format_version": 1, "scene": "ours", "family": {}, "seed": 1, "shard_size": 9, "splits": entries, "statistics": statistics},
+    )
     export(data, tmp_path / "exported", format)
     done = take(tmp_path / "exported", tmp_path / "out", format, gravity=[0.0] * dim)
     assert done.trajectories == {"train": 9, "valid": 1, "test": 2} and done.doubtful == []
@@ -294,8 +300,12 @@ def test_statistics_beside_those_stated(tmp_path):
     save_h5(folder / "train.h5", [(position, [5])])
     done = take(folder, tmp_path / "out", "lagrangebench")
     deviations = {entry.name: entry.deviation for entry in done.statistics}
-    assert deviations == {"velocity_mean": pytest.approx(0.008), "velocity_std": pytest.approx(0.2), "acceleration_mean": 0.0,
-                          "acceleration_std": np.inf}
+    assert deviations == {
+        "velocity_mean": pytest.approx(0.008),
+        "velocity_std": pytest.approx(0.2),
+        "acceleration_mean": 0.0,
+        "acceleration_std": np.inf,
+    }
     assert [entry.name for entry in done.doubtful] == ["velocity_std", "acceleration_std"]
     describe(folder)
     assert take(folder, tmp_path / "silent", "lagrangebench").doubtful == []

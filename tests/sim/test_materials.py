@@ -482,11 +482,22 @@ def test_log1p_excess():
 
 def solver_scene(materials, bodies, **changes):
     """2D, unit box of 16 cells; materials by name; a body is (material, lower, upper[, velocity])."""
-    bodies = [{"material": name, "kind": "box", "lower": lower, "upper": upper, "velocity": (*velocity, [0.0, 0.0])[0]}
-              for name, lower, upper, *velocity in bodies]
+    bodies = [
+        {"material": name, "kind": "box", "lower": lower, "upper": upper, "velocity": (*velocity, [0.0, 0.0])[0]}
+        for name, lower, upper, *velocity in bodies
+    ]
     content = {
-        "name": "test", "dim": 2, "bounds": [[0.0, 1.0]] * 2, "gravity": [0.0, -9.8], "frame_step": 0.01, "frames": 30, "radius": 0.1,
-        "cells": [16] * 2, "materials": {name: material.model_dump() for name, material in materials.items()}, "seed": 3, "jitter": 0.2,
+        "name": "test",
+        "dim": 2,
+        "bounds": [[0.0, 1.0]] * 2,
+        "gravity": [0.0, -9.8],
+        "frame_step": 0.01,
+        "frames": 30,
+        "radius": 0.1,
+        "cells": [16] * 2,
+        "materials": {name: material.model_dump() for name, material in materials.items()},
+        "seed": 3,
+        "jitter": 0.2,
         "bodies": bodies,
     }
     return Scene.from_dict(content | changes)
@@ -549,8 +560,9 @@ def test_five_materials_in_one_run():
     """Each alone would do; together in free space they collide, keep their momentum to round-off, and all are still there."""
     names = ["water", "sand", "goop", "elastic", "snow"]
     places = [[0.25, 0.1875], [0.5, 0.1875], [0.25, 0.4375], [0.5, 0.4375], [0.375, 0.6875]]
-    bodies = [(name, at, [at[0] + 0.1875, at[1] + 0.1875], [0.8 * (0.45 - at[0]), 0.8 * (0.44 - at[1])])
-              for name, at in zip(names, places, strict=True)]
+    bodies = [
+        (name, at, [at[0] + 0.1875, at[1] + 0.1875], [0.8 * (0.45 - at[0]), 0.8 * (0.44 - at[1])]) for name, at in zip(names, places, strict=True)
+    ]
     what = solver_scene({name: MATERIALS[name] for name in names}, bodies, gravity=[0.0, 0.0])
     solver = MPMSimulator()
     solver.load(what)
@@ -606,8 +618,15 @@ def test_every_material_has_a_rate_and_says_what_is_left_out():
     others = ("wcsph", "dfsph", "pbf")  # solvers that ask for their own
     assert {(dim, name) for dim in (2, 3) for name in (*MODELS, *others)} == set(RATES)
     family = {
-        "name": "all", "dim": 2, "bounds": [[0.0, 1.0]] * 2, "gravity": [0.0, -9.8], "frame_step": 0.01, "frames": 30, "radius": 0.1,
-        "cells": [16, 16], "splits": {"train": 1, "valid": 0, "test": 0},
+        "name": "all",
+        "dim": 2,
+        "bounds": [[0.0, 1.0]] * 2,
+        "gravity": [0.0, -9.8],
+        "frame_step": 0.01,
+        "frames": 30,
+        "radius": 0.1,
+        "cells": [16, 16],
+        "splits": {"train": 1, "valid": 0, "test": 0},
         "materials": {name: MATERIALS[name].model_dump() for name in ("water", "sand", "goop", "elastic", "snow")},
         "bodies": [{"material": "goop", "shape": {"kind": "ball", "radius": 0.1}}],
     }

@@ -41,11 +41,23 @@ def taichi():
 def scene(bodies, materials=None, **changes):
     """A resolved scene: unit box of 16 cells an axis; a body is (material, lower, upper[, velocity])."""
     dim = len(bodies[0][1])
-    bodies = [{"material": name, "kind": "box", "lower": lower, "upper": upper, "velocity": (*velocity, [0.0] * dim)[0]}
-              for name, lower, upper, *velocity in bodies]
+    bodies = [
+        {"material": name, "kind": "box", "lower": lower, "upper": upper, "velocity": (*velocity, [0.0] * dim)[0]}
+        for name, lower, upper, *velocity in bodies
+    ]
     content = {
-        "name": "test", "dim": dim, "bounds": [[0.0, 1.0]] * dim, "gravity": [0.0] * (dim - 1) + [-9.8], "frame_step": 0.01, "frames": 30,
-        "radius": 0.1, "cells": [16] * dim, "materials": materials or {"water": WATER}, "seed": 3, "jitter": 0.2, "bodies": bodies,
+        "name": "test",
+        "dim": dim,
+        "bounds": [[0.0, 1.0]] * dim,
+        "gravity": [0.0] * (dim - 1) + [-9.8],
+        "frame_step": 0.01,
+        "frames": 30,
+        "radius": 0.1,
+        "cells": [16] * dim,
+        "materials": materials or {"water": WATER},
+        "seed": 3,
+        "jitter": 0.2,
+        "bodies": bodies,
     }
     return Scene.from_dict(content | changes)
 
@@ -533,6 +545,7 @@ def test_the_volume_of_a_lone_particle_rings_within_bounds(cfl):
 
 def test_only_materials_that_ring_bound_the_step_of_a_lone_particle():
     """Sand, slack when it is parted, takes the Courant number that was asked for; cohesive sand and water do not."""
+
     def courant(material):
         solver = MPMSimulator(cfl=1.2)
         solver.load(scene([("stuff", [0.25, 0.25], [0.5, 0.5])], {"stuff": material}, gravity=[0.0, 0.0], frame_step=0.05))
@@ -628,9 +641,14 @@ def test_parallel_kernels_agree_with_serial_ones(request, material):
 
 # -- three dimensions
 
-POND = scene([("water", [0.125, 0.125, 0.25], [0.375, 0.5, 0.625], [0.5, 0.0, -1.0]),
-              ("sand", [0.6875, 0.25, 0.375], [0.9375, 0.5, 0.75], [-0.25, 0.25, 0.0])],
-             {"water": WATER, "sand": SAND}, walls={"friction": 0.3})
+POND = scene(
+    [
+        ("water", [0.125, 0.125, 0.25], [0.375, 0.5, 0.625], [0.5, 0.0, -1.0]),
+        ("sand", [0.6875, 0.25, 0.375], [0.9375, 0.5, 0.75], [-0.25, 0.25, 0.0]),
+    ],
+    {"water": WATER, "sand": SAND},
+    walls={"friction": 0.3},
+)
 
 
 def test_3d_free_fall(cube):
@@ -659,9 +677,12 @@ def test_3d_drop_stays_inside_and_piles_up(cube):
 
 def test_3d_momentum(cube):
     """Two bodies of different density collide in free space: the momentum of mass x velocity stays."""
-    what = scene([("water", [0.25, 0.25, 0.25], [0.5, 0.5, 0.5], [0.5, 0.0, 0.0]),
-                  ("sand", [0.5625, 0.25, 0.25], [0.75, 0.5, 0.5], [-0.5, 0.25, 0.0])],
-                 {"water": WATER, "sand": SAND}, walls={"friction": 0.3}, gravity=[0.0, 0.0, 0.0])
+    what = scene(
+        [("water", [0.25, 0.25, 0.25], [0.5, 0.5, 0.5], [0.5, 0.0, 0.0]), ("sand", [0.5625, 0.25, 0.25], [0.75, 0.5, 0.5], [-0.5, 0.25, 0.0])],
+        {"water": WATER, "sand": SAND},
+        walls={"friction": 0.3},
+        gravity=[0.0, 0.0, 0.0],
+    )
     cube.load(what)
     particles = what.particles()
     mass = np.array([1000.0, 1800.0])[particles.material][:, None]

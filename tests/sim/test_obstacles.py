@@ -75,10 +75,16 @@ def test_sign_of_a_polygon_that_is_not_convex():
 @pytest.mark.parametrize(
     ("content", "point", "distance", "normal"),
     [
-        (SOLIDS[2][4], [0.4, 0.9], 0.1, [0, 1]), (SOLIDS[2][4], [0.3, 0.6], -0.1, [-1, 0]),
-        (SOLIDS[2][5], [0.1, 0.5], 0.1, [-1, 0]), (SOLIDS[2][5], [0.45, 0.6], -0.05, [1, 0]), (SOLIDS[2][5], [0.8, 1.3], 0.5, [0.6, 0.8]),
-        (SOLIDS[2][1], [0.6, 0.5], 0.1, [0, 1]), (SOLIDS[2][1], [0.3, 0.8], -0.1, [0, 1]), (SOLIDS[2][1], [0.7, 0.25], -0.05, [0, -1]),
-        (SOLIDS[2][3], [-0.3, 0.3], 0.1, [0, 1]), (SOLIDS[2][3], [1.2, 0.2], -0.1, [0, 1]),
+        (SOLIDS[2][4], [0.4, 0.9], 0.1, [0, 1]),
+        (SOLIDS[2][4], [0.3, 0.6], -0.1, [-1, 0]),
+        (SOLIDS[2][5], [0.1, 0.5], 0.1, [-1, 0]),
+        (SOLIDS[2][5], [0.45, 0.6], -0.05, [1, 0]),
+        (SOLIDS[2][5], [0.8, 1.3], 0.5, [0.6, 0.8]),
+        (SOLIDS[2][1], [0.6, 0.5], 0.1, [0, 1]),
+        (SOLIDS[2][1], [0.3, 0.8], -0.1, [0, 1]),
+        (SOLIDS[2][1], [0.7, 0.25], -0.05, [0, -1]),
+        (SOLIDS[2][3], [-0.3, 0.3], 0.1, [0, 1]),
+        (SOLIDS[2][3], [1.2, 0.2], -0.1, [0, 1]),
         ({"kind": "segment", "start": [0, 0], "end": [1, 0], "thickness": 0.2}, [0.5, -0.3], 0.2, [0, -1]),
         ({"kind": "segment", "start": [0, 0], "end": [1, 0], "thickness": 0.2}, [1.3, 0.4], 0.4, [0.6, 0.8]),
         ({"kind": "segment", "start": [0, 0], "end": [1, 0], "thickness": 0.2}, [0.5, 0.0], -0.1, [0, 1]),
@@ -122,8 +128,16 @@ def shapes(tmp_path):
 
 def mesh_family(file, **changes):
     content = {
-        "name": "mesh", "dim": 3, "bounds": [[0, 1]] * 3, "gravity": [0, 0, -9.8], "frame_step": 0.01, "frames": 5, "radius": 0.2,
-        "cells": [12] * 3, "materials": {"water": {"model": "water", "sound_speed": 5.0}}, "splits": {"train": 1, "valid": 0, "test": 0},
+        "name": "mesh",
+        "dim": 3,
+        "bounds": [[0, 1]] * 3,
+        "gravity": [0, 0, -9.8],
+        "frame_step": 0.01,
+        "frames": 5,
+        "radius": 0.2,
+        "cells": [12] * 3,
+        "materials": {"water": {"model": "water", "sound_speed": 5.0}},
+        "splits": {"train": 1, "valid": 0, "test": 0},
         "bodies": [{"material": "water", "shape": {"kind": "box", "size": [0.3, 0.3, 0.2]}, "center": [0.5, 0.5, 0.85]}],
         "obstacles": [{"kind": "mesh", "file": file, "scale": 0.5, "center": [0.5, 0.5, 0.4]}],
     }
@@ -166,8 +180,15 @@ def test_meshes_that_cannot_be_used(shapes, damage, tmp_path):
 # -- families
 
 BASE = {
-    "name": "ramps", "dim": 2, "bounds": [[0.0, 1.0], [0.0, 1.0]], "gravity": [0.0, -9.8], "frame_step": 0.01, "frames": 12, "radius": 0.1,
-    "cells": [20, 20], "materials": {"water": {"model": "water", "sound_speed": 5.0}},
+    "name": "ramps",
+    "dim": 2,
+    "bounds": [[0.0, 1.0], [0.0, 1.0]],
+    "gravity": [0.0, -9.8],
+    "frame_step": 0.01,
+    "frames": 12,
+    "radius": 0.1,
+    "cells": [20, 20],
+    "materials": {"water": {"model": "water", "sound_speed": 5.0}},
     "bodies": [{"material": "water", "shape": {"kind": "box", "size": [0.25, 0.25]}}],
     "obstacles": [{"kind": "segment", "count": [1, 3], "length": [0.2, 0.5], "angle": [-45, 45], "thickness": 0.08}],
     "splits": {"train": 6, "valid": 2, "test": 2},
@@ -284,9 +305,19 @@ def scene(obstacles, bodies=None, **changes):
     dim = changes.get("dim", 2)
     bodies = bodies or [{"material": "water", "kind": "box", "lower": [0.25] * (dim - 1) + [0.6], "upper": [0.75] * (dim - 1) + [0.9]}]
     content = {
-        "name": "test", "dim": dim, "bounds": [[0.0, 1.0]] * dim, "gravity": [0.0] * (dim - 1) + [-9.8], "frame_step": 0.01, "frames": 30,
-        "radius": 0.1, "cells": [16] * dim, "materials": {"water": {"model": "water", "sound_speed": 10.0}}, "seed": 3, "jitter": 0.2,
-        "bodies": [{"velocity": [0.0] * dim} | body for body in bodies], "obstacles": obstacles,
+        "name": "test",
+        "dim": dim,
+        "bounds": [[0.0, 1.0]] * dim,
+        "gravity": [0.0] * (dim - 1) + [-9.8],
+        "frame_step": 0.01,
+        "frames": 30,
+        "radius": 0.1,
+        "cells": [16] * dim,
+        "materials": {"water": {"model": "water", "sound_speed": 10.0}},
+        "seed": 3,
+        "jitter": 0.2,
+        "bodies": [{"velocity": [0.0] * dim} | body for body in bodies],
+        "obstacles": obstacles,
     }
     return Scene.from_dict(content | changes)
 
@@ -377,8 +408,9 @@ def test_nothing_leaks_through_the_thinnest_plate(wet, speed):
 
 def test_a_plate_works_on_both_faces(wet):
     """Without gravity, shot at from below."""
-    what = scene([PLATE], [{"material": "water", "kind": "box", "lower": [0.25, 0.05], "upper": [0.75, 0.3], "velocity": [0.0, 20.0]}],
-                 gravity=[0.0, 0.0])
+    what = scene(
+        [PLATE], [{"material": "water", "kind": "box", "lower": [0.25, 0.05], "upper": [0.75, 0.3], "velocity": [0.0, 20.0]}], gravity=[0.0, 0.0]
+    )
     wet.load(what)
     for _ in range(40):
         last = wet.frame()[: len(what.particles().position)]
@@ -394,8 +426,12 @@ def test_a_pool_rests_on_either_face_of_a_plate(wet, down, offset, thickness):
     plate = {"kind": "segment", "start": [-0.2, middle], "end": [1.2, middle], "thickness": thickness / 16}
     far = middle - down * (thickness / 32 + 0.25)
     near = middle - down * thickness / 32
-    what = scene([plate], [{"material": "water", "kind": "box", "lower": [0.0, min(near, far)], "upper": [1.0, max(near, far)]}],
-                 gravity=[0.0, 9.8 * down], jitter=0.0)
+    what = scene(
+        [plate],
+        [{"material": "water", "kind": "box", "lower": [0.0, min(near, far)], "upper": [1.0, max(near, far)]}],
+        gravity=[0.0, 9.8 * down],
+        jitter=0.0,
+    )
     wet.load(what)
     for _ in range(100):
         last = wet.frame()[: len(what.particles().position)].astype(float)
@@ -406,9 +442,13 @@ def test_a_pool_rests_on_either_face_of_a_plate(wet, down, offset, thickness):
 
 def test_particles_stay_out_of_curved_and_notched_solids(wet):
     """Between nodes the distance is interpolated: off by dx^2 / 8 r on curves, more at the end of a plate, whose r is 3/4 dx."""
-    what = scene([{"kind": "floor", "vertices": [[0, 0.3], [0.3, 0.1], [0.6, 0.35], [1, 0.15]]},
-                  {"kind": "ball", "center": [0.5, 0.5], "radius": 0.1},
-                  {"kind": "segment", "start": [0.1, 0.55], "end": [0.3, 0.5], "thickness": 0.1}])
+    what = scene(
+        [
+            {"kind": "floor", "vertices": [[0, 0.3], [0.3, 0.1], [0.6, 0.35], [1, 0.15]]},
+            {"kind": "ball", "center": [0.5, 0.5], "radius": 0.1},
+            {"kind": "segment", "start": [0.1, 0.55], "end": [0.3, 0.5], "thickness": 0.1},
+        ]
+    )
     wet.load(what)
     for _ in range(150):
         last = wet.frame()[: len(what.particles().position)].astype(float)
@@ -438,9 +478,14 @@ def test_a_frozen_shower_slides_as_friction_says(wet, angle):
 def test_a_pool_rests_on_a_slope_with_its_own_pressure(wet, fall, friction):
     """rho g (H - y) of the particles within a cell of the surface, in the mean over them and 200 frames. Held nodes gave 1.04 to 1.34 of it."""
     vertices, top, c = [[0.0, 0.25 + fall / 2], [1.0, 0.25 - fall / 2]], 0.75, 30.0
-    what = scene([{"kind": "floor", "vertices": vertices, "friction": friction}], cells=[24, 24], frame_step=0.005, jitter=0.0,
-                 materials={"water": {"model": "water", "sound_speed": c}},
-                 bodies=[{"material": "water", "kind": "polygon", "vertices": [*vertices, [1.0, top], [0.0, top]]}])
+    what = scene(
+        [{"kind": "floor", "vertices": vertices, "friction": friction}],
+        cells=[24, 24],
+        frame_step=0.005,
+        jitter=0.0,
+        materials={"water": {"model": "water", "sound_speed": c}},
+        bodies=[{"material": "water", "kind": "polygon", "vertices": [*vertices, [1.0, top], [0.0, top]]}],
+    )
     wet.load(what)
     seen = []
     for frame in range(300):
@@ -486,8 +531,11 @@ def test_many_particles_and_many_columns_do_not_compile_in_turns():
     """The first outgrows the second's fields in columns, the second the first's in particles."""
     floor = {"kind": "floor", "vertices": [[0.0, 0.1], [1.0, 0.3]]}
     few = scene([floor], [{"material": "water", "kind": "box", "lower": [0.4, 0.6], "upper": [0.6, 0.8]}])
-    many = scene([{"kind": "ball", "center": [0.5, 0.2], "radius": 0.05}],
-                 [{"material": "water", "kind": "box", "lower": [0.0, 0.5], "upper": [1.0, 1.0]}], particles_per_cell=3)
+    many = scene(
+        [{"kind": "ball", "center": [0.5, 0.2], "radius": 0.05}],
+        [{"material": "water", "kind": "box", "lower": [0.0, 0.5], "upper": [1.0, 1.0]}],
+        particles_per_cell=3,
+    )
     simulator, rooms = MPMSimulator(), []
     for what in (few, many, few, many):
         simulator.load(what)

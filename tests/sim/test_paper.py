@@ -14,7 +14,10 @@ from sim.scene import SceneFamily
 
 def dataset(path, scene="waterdrop", **statistics):
     found = {
-        "velocity_std": [1.372e-3, 1.312e-3], "acceleration_std": [6.74e-5, 8.70e-5], "particles": [800, 1000.0, 1200], "frames": 1001,
+        "velocity_std": [1.372e-3, 1.312e-3],
+        "acceleration_std": [6.74e-5, 8.70e-5],
+        "particles": [800, 1000.0, 1200],
+        "frames": 1001,
         "neighbours": 12.0,
     }
     family = {"frame_step": 0.0025, "radius": 0.015}
@@ -33,8 +36,11 @@ def test_the_published_figures_miss_nothing(tmp_path):
 @pytest.mark.parametrize(
     ("change", "label"),
     [
-        ({"velocity_std": [1.372e-3 * 1.51, 1.312e-3]}, "velocity std x"), ({"acceleration_std": [6.74e-5, 8.70e-5 / 1.51]}, "acceleration std y"),
-        ({"neighbours": 12 * 1.16}, "neighbours"), ({"neighbours": 12 * 0.84}, "neighbours"), ({"frames": 1000}, "steps"),
+        ({"velocity_std": [1.372e-3 * 1.51, 1.312e-3]}, "velocity std x"),
+        ({"acceleration_std": [6.74e-5, 8.70e-5 / 1.51]}, "acceleration std y"),
+        ({"neighbours": 12 * 1.16}, "neighbours"),
+        ({"neighbours": 12 * 0.84}, "neighbours"),
+        ({"frames": 1000}, "steps"),
     ],
 )
 def test_what_is_off_is_said_in_its_row(tmp_path, change, label):

@@ -39,11 +39,24 @@ MATERIALS = {"water": {"model": "water"}, "cube": {"model": "rigid", "density": 
 
 def scene(bodies, dim=2, **changes):
     """A unit box of 16 particles along an edge; a body is (material, lower, upper) and perhaps a velocity."""
-    bodies = [{"material": name, "kind": "box", "lower": lower, "upper": upper, "velocity": (velocity or [[0.0] * dim])[0]}
-              for name, lower, upper, *velocity in bodies]
+    bodies = [
+        {"material": name, "kind": "box", "lower": lower, "upper": upper, "velocity": (velocity or [[0.0] * dim])[0]}
+        for name, lower, upper, *velocity in bodies
+    ]
     content = {
-        "name": "test", "dim": dim, "bounds": [[0.0, 1.0]] * dim, "gravity": [0.0, -9.8, 0.0][:dim], "frame_step": 0.01, "frames": 30, "radius": 0.1,
-        "cells": [16] * dim, "particles_per_cell": 1, "solver": {"method": "pbf"}, "materials": MATERIALS, "seed": 3, "bodies": bodies,
+        "name": "test",
+        "dim": dim,
+        "bounds": [[0.0, 1.0]] * dim,
+        "gravity": [0.0, -9.8, 0.0][:dim],
+        "frame_step": 0.01,
+        "frames": 30,
+        "radius": 0.1,
+        "cells": [16] * dim,
+        "particles_per_cell": 1,
+        "solver": {"method": "pbf"},
+        "materials": MATERIALS,
+        "seed": 3,
+        "bodies": bodies,
     }
     return Scene.from_dict(content | changes)
 
@@ -410,9 +423,19 @@ REFUSED = {
     "another's setting": ({"solver": {"method": "pbf", "divergence_error": 0.1}}, r"yaml: solver\.divergence_error = 0\.1: unknown key"),
 }
 FAMILY = {
-    "name": "tiny", "dim": 2, "bounds": [[0.0, 1.0], [0.0, 1.0]], "gravity": [0.0, -9.8], "frame_step": 0.01, "frames": 12, "radius": 0.1,
-    "cells": [16, 16], "particles_per_cell": 1, "solver": {"method": "pbf"}, "materials": {"water": {"model": "water"}},
-    "bodies": [{"material": "water", "shape": {"kind": "box", "size": [[0.2, 0.4], [0.2, 0.4]]}}], "splits": {"train": 6, "valid": 2, "test": 2},
+    "name": "tiny",
+    "dim": 2,
+    "bounds": [[0.0, 1.0], [0.0, 1.0]],
+    "gravity": [0.0, -9.8],
+    "frame_step": 0.01,
+    "frames": 12,
+    "radius": 0.1,
+    "cells": [16, 16],
+    "particles_per_cell": 1,
+    "solver": {"method": "pbf"},
+    "materials": {"water": {"model": "water"}},
+    "bodies": [{"material": "water", "shape": {"kind": "box", "size": [[0.2, 0.4], [0.2, 0.4]]}}],
+    "splits": {"train": 6, "valid": 2, "test": 2},
 }
 
 

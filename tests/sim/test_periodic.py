@@ -27,8 +27,16 @@ def drift(frames=6, axes=("x",)):
     """One particle that leaves through the right face at 1.5 a frame, one that stands at (4.75, 1.25): x = 2, 3.5, 1, 2.5, 4, 1.5."""
     x = np.array([2, 3.5, 1, 2.5, 4, 1.5], np.float32)[:frames]
     position = np.stack([np.stack([x, np.ones_like(x)], 1), np.tile(np.float32([4.75, 1.25]), (frames, 1))], 1)
-    return Trajectory(position=position, particle_type=np.array([5, 5], np.int8), frame_step=0.5, radius=0.6, bounds=BOUNDS,
-                      scene=CHANNEL | {"periodic": list(axes)}, seed=1, simulator={"name": "none"})
+    return Trajectory(
+        position=position,
+        particle_type=np.array([5, 5], np.int8),
+        frame_step=0.5,
+        radius=0.6,
+        bounds=BOUNDS,
+        scene=CHANNEL | {"periodic": list(axes)},
+        seed=1,
+        simulator={"name": "none"},
+    )
 
 
 def test_by_hand():
@@ -96,8 +104,10 @@ def data(tmp_path):
     write_shard(tmp_path / "data/train/shard-00000.h5", {0: drift()})
     entry = {"trajectories": 1, "ok": 1, "failed": [], "shards": ["train/shard-00000.h5"]}
     statistics = training_statistics([tmp_path / "data/train/shard-00000.h5"])
-    write_json(tmp_path / "data/dataset.json", {"format_version": 1, "scene": "channel", "family": {}, "seed": 1, "shard_size": 8,
-                                                "splits": {"train": entry}, "statistics": statistics})
+    write_json(
+        tmp_path / "data/dataset.json",
+        {"format_version": 1, "scene": "channel", "family": {}, "seed": 1, "shard_size": 8, "splits": {"train": entry}, "statistics": statistics},
+    )
     return tmp_path / "data"
 
 

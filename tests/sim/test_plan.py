@@ -11,8 +11,15 @@ from sim.plan import plan, plan_text
 from sim.scene import SceneFamily
 
 FAMILY = {
-    "name": "tiny", "dim": 2, "bounds": [[0.0, 1.0], [0.0, 1.0]], "gravity": [0.0, -9.8], "frame_step": 0.01, "frames": 30, "radius": 0.1,
-    "cells": [16, 16], "splits": {"train": 10, "valid": 2, "test": 0},
+    "name": "tiny",
+    "dim": 2,
+    "bounds": [[0.0, 1.0], [0.0, 1.0]],
+    "gravity": [0.0, -9.8],
+    "frame_step": 0.01,
+    "frames": 30,
+    "radius": 0.1,
+    "cells": [16, 16],
+    "splits": {"train": 10, "valid": 2, "test": 0},
 }
 # Water much stiffer than its flow is fast: softer water stiffens where it is squeezed, and then takes more substeps than planned.
 MATERIALS = {"water": {"model": "water", "sound_speed": 25.0}, "sand": {"model": "sand", "young_modulus": 1e4, "friction_angle": 35}}
@@ -46,17 +53,32 @@ def test_a_run_builds_and_costs_what_the_plan_says(material, built):
 PARTS = {
     "obstacles": {"obstacles": [{"kind": "ball", "radius": 0.1, "count": [1, 1], "center": [0.2, 0.2]}]},
     "container": {"container": {"amplitude": [[1.0, 2.0], 0.0], "frequency": 1.0}},
-    "rigid": {"materials": {"water": MATERIALS["water"], "box": {"model": "rigid", "density": 500.0}},
-              "bodies": [{"material": "water", "shape": {"kind": "box", "size": [0.4, 0.3]}},
-                         {"material": "box", "shape": {"kind": "box", "size": [0.2, 0.1]}}]},
-    "rigid among obstacles": {"obstacles": [{"kind": "ball", "radius": 0.1, "center": [0.2, 0.2]}],
-                              "materials": {"water": MATERIALS["water"], "box": {"model": "rigid", "density": 500.0}},
-                              "bodies": [{"material": "water", "shape": {"kind": "box", "size": [0.3, 0.2]}, "center": [0.3, 0.8]},
-                                         {"material": "box", "shape": {"kind": "box", "size": [0.2, 0.1]}, "center": [0.7, 0.5]}]},
-    "material": {"materials": {"water": MATERIALS["water"], "brine": MATERIALS["water"]},
-                 "bodies": [{"material": name, "shape": {"kind": "box", "size": [0.3, 0.3]}} for name in ("water", "brine")]},
-    "dimension": {"dim": 3, "bounds": [[0.0, 1.0]] * 3, "gravity": [0.0, -9.8, 0.0], "cells": [12, 12, 12],
-                  "bodies": [{"material": "water", "shape": {"kind": "box", "size": [0.3, 0.3, 0.3]}}]},
+    "rigid": {
+        "materials": {"water": MATERIALS["water"], "box": {"model": "rigid", "density": 500.0}},
+        "bodies": [
+            {"material": "water", "shape": {"kind": "box", "size": [0.4, 0.3]}},
+            {"material": "box", "shape": {"kind": "box", "size": [0.2, 0.1]}},
+        ],
+    },
+    "rigid among obstacles": {
+        "obstacles": [{"kind": "ball", "radius": 0.1, "center": [0.2, 0.2]}],
+        "materials": {"water": MATERIALS["water"], "box": {"model": "rigid", "density": 500.0}},
+        "bodies": [
+            {"material": "water", "shape": {"kind": "box", "size": [0.3, 0.2]}, "center": [0.3, 0.8]},
+            {"material": "box", "shape": {"kind": "box", "size": [0.2, 0.1]}, "center": [0.7, 0.5]},
+        ],
+    },
+    "material": {
+        "materials": {"water": MATERIALS["water"], "brine": MATERIALS["water"]},
+        "bodies": [{"material": name, "shape": {"kind": "box", "size": [0.3, 0.3]}} for name in ("water", "brine")],
+    },
+    "dimension": {
+        "dim": 3,
+        "bounds": [[0.0, 1.0]] * 3,
+        "gravity": [0.0, -9.8, 0.0],
+        "cells": [12, 12, 12],
+        "bodies": [{"material": "water", "shape": {"kind": "box", "size": [0.3, 0.3, 0.3]}}],
+    },
 }
 
 
@@ -70,8 +92,13 @@ def test_parts_of_a_scene_build_what_the_plan_says(part, built):
     assert Counter(field for field in built["fields"] if field[1] > 8) == Counter(map(tuple, promised["fields"].values()))
     assert built["kernels"] == set(promised["kernels"])
     bare = MPMSimulator().plan(family("water", frames=3).sample(0))
-    own = {"obstacles": "signed distance", "container": "changing gravity", "rigid": "rigid bodies", "material": "material of a particle",
-           "dimension": "third dimension"}[part.split()[0]]
+    own = {
+        "obstacles": "signed distance",
+        "container": "changing gravity",
+        "rigid": "rigid bodies",
+        "material": "material of a particle",
+        "dimension": "third dimension",
+    }[part.split()[0]]
     assert own in bare["left_out"] and own not in promised["left_out"]
     of_the_new = {f"{what} of brine" for what in ("F", "decomposition", "viscosity")} if part == "material" else set()
     assert set(promised["left_out"]) - set(bare["left_out"]) <= {"obstacle friction", "deformation of rigid bodies of box"} | of_the_new

@@ -22,8 +22,18 @@ def scene(bodies, materials=None, **changes):
     dim = changes.get("dim", 2)
     bodies = [{"material": name, "velocity": [0.0] * dim} | geometry for name, geometry in bodies]
     content = {
-        "name": "test", "dim": dim, "bounds": [[0.0, 1.0]] * dim, "gravity": [0.0] * (dim - 1) + [-9.8], "frame_step": 0.01, "frames": 30,
-        "radius": 0.1, "cells": [16] * dim, "materials": materials or {"wood": WOOD}, "seed": 3, "jitter": 0.2, "bodies": bodies,
+        "name": "test",
+        "dim": dim,
+        "bounds": [[0.0, 1.0]] * dim,
+        "gravity": [0.0] * (dim - 1) + [-9.8],
+        "frame_step": 0.01,
+        "frames": 30,
+        "radius": 0.1,
+        "cells": [16] * dim,
+        "materials": materials or {"wood": WOOD},
+        "seed": 3,
+        "jitter": 0.2,
+        "bodies": bodies,
     }
     return Scene.from_dict(content | changes)
 
@@ -151,8 +161,9 @@ def test_a_block_falls_and_rests_on_its_true_face(blocks):
 
 def test_two_blocks_collide(blocks):
     """Head on, off centre: momenta to rounding, no overlap, energy falls."""
-    what = scene([("wood", box([0.125, 0.375], [0.375, 0.625], [1.0, 0.0])), ("wood", box([0.625, 0.4375], [0.875, 0.6875], [-0.5, 0.0]))],
-                 gravity=[0.0, 0.0])
+    what = scene(
+        [("wood", box([0.125, 0.375], [0.375, 0.625], [1.0, 0.0])), ("wood", box([0.625, 0.4375], [0.875, 0.6875], [-0.5, 0.0]))], gravity=[0.0, 0.0]
+    )
     blocks.load(what)
     particles = what.particles()
     mass, one = np.full(len(particles.position), 600 * what.spacing**2), particles.body == 0
@@ -175,7 +186,9 @@ def test_momentum_of_a_body_struck_by_water(dim):
     low, high = [0.25] * (dim - 1), [0.5] * (dim - 1)
     what = scene(
         [("water", box([0.25, *low], [0.5, *high], [1.0] + [0.2] * (dim - 1))), ("wood", box([0.5625, *low], [0.75, *high]))],
-        {"water": WATER, "wood": WOOD}, dim=dim, gravity=[0.0] * dim,
+        {"water": WATER, "wood": WOOD},
+        dim=dim,
+        gravity=[0.0] * dim,
     )
     simulator = MPMSimulator()
     simulator.load(what)
@@ -313,10 +326,13 @@ def test_a_cube_slides_and_sticks_in_3d(floor, angle, friction, way):
 def test_no_particle_of_a_body_enters_an_obstacle_or_leaves_the_box():
     """A ball, a polygon and a box thrown about over a floor with a notch; speeds of 20 sqrt(g H)."""
     what = scene(
-        [("wood", {"kind": "ball", "center": [0.2, 0.7], "radius": 0.1, "velocity": [30.0, -50.0]}),
-         ("wood", box([0.4, 0.6], [0.6, 0.8], [0.0, -20.0])),
-         ("wood", {"kind": "polygon", "vertices": [[0.7, 0.6], [0.95, 0.65], [0.8, 0.85]], "velocity": [-10.0, -30.0]})],
-        obstacles=[{"kind": "floor", "vertices": [[0, 0.3], [0.4, 0.1], [1, 0.4]]}], walls={"friction": 0.3},
+        [
+            ("wood", {"kind": "ball", "center": [0.2, 0.7], "radius": 0.1, "velocity": [30.0, -50.0]}),
+            ("wood", box([0.4, 0.6], [0.6, 0.8], [0.0, -20.0])),
+            ("wood", {"kind": "polygon", "vertices": [[0.7, 0.6], [0.95, 0.65], [0.8, 0.85]], "velocity": [-10.0, -30.0]}),
+        ],
+        obstacles=[{"kind": "floor", "vertices": [[0, 0.3], [0.4, 0.1], [1, 0.4]]}],
+        walls={"friction": 0.3},
     )
     simulator = MPMSimulator()
     simulator.load(what)

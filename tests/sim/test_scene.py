@@ -20,8 +20,15 @@ from sim.trajectory import PARTICLE_TYPES, ShardReader, Trajectory, write_shard
 SCENES = sorted((Path(__file__).parents[2] / "configs/scenes").glob("*.yaml"))
 
 BASE = {
-    "name": "tiny", "dim": 2, "bounds": [[0.0, 1.0], [0.0, 1.0]], "gravity": [0.0, -9.8], "frame_step": 0.01, "frames": 12, "radius": 0.1,
-    "cells": [16, 16], "jitter": 0.3,
+    "name": "tiny",
+    "dim": 2,
+    "bounds": [[0.0, 1.0], [0.0, 1.0]],
+    "gravity": [0.0, -9.8],
+    "frame_step": 0.01,
+    "frames": 12,
+    "radius": 0.1,
+    "cells": [16, 16],
+    "jitter": 0.3,
     "materials": {"water": {"model": "water", "sound_speed": 5.0}, "sand": {"model": "sand", "young_modulus": 1e5, "friction_angle": 35}},
     "bodies": [
         {"material": "sand", "shape": {"kind": "polygon", "radius": [0.1, 0.15]}, "count": [1, 2], "velocity": [[-1, 1], 0.0]},
@@ -221,8 +228,10 @@ def test_mistakes_name_file_key_value_and_remedy(case):
 
 @pytest.mark.parametrize(
     ("bodies", "message"),
-    [([{"material": "water", "shape": {"kind": "box", "size": [0.2, 0.2]}, "center": [0.05, 0.5]}], "outside the box"),
-     ([{"material": "water", "shape": {"kind": "ball", "radius": 0.1}, "center": [0.5, 0.5], "count": [2, 2]}], "overlapping another body")],
+    [
+        ([{"material": "water", "shape": {"kind": "box", "size": [0.2, 0.2]}, "center": [0.05, 0.5]}], "outside the box"),
+        ([{"material": "water", "shape": {"kind": "ball", "radius": 0.1}, "center": [0.5, 0.5], "count": [2, 2]}], "overlapping another body"),
+    ],
 )
 def test_impossible_places(bodies, message, monkeypatch):
     monkeypatch.setattr("sim.scene._TRIES", 5)
@@ -250,9 +259,16 @@ def test_variants():
 
 @pytest.mark.parametrize(
     ("text", "message"),
-    [("a: [1", "not valid YAML"), ("a: 1\na: 2", "line 2 = \"duplicate key 'a'\""), ("- 1", "must be a mapping"), ("", "must be a mapping"),
-     ("1: 2", "not text"), ("a: !!python/object/apply:os.system [id]", "not valid YAML"), ("a: &x [*x, *x]", "scene.yaml"),
-     ("? [1, 2]\n: 3", "not text")],
+    [
+        ("a: [1", "not valid YAML"),
+        ("a: 1\na: 2", "line 2 = \"duplicate key 'a'\""),
+        ("- 1", "must be a mapping"),
+        ("", "must be a mapping"),
+        ("1: 2", "not text"),
+        ("a: !!python/object/apply:os.system [id]", "not valid YAML"),
+        ("a: &x [*x, *x]", "scene.yaml"),
+        ("? [1, 2]\n: 3", "not text"),
+    ],
 )
 def test_files_that_are_not_scenes(tmp_path, text, message):
     path = tmp_path / "scene.yaml"

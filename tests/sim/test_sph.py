@@ -160,8 +160,10 @@ def test_the_table_of_walls_is_the_sum_over_layers(dim, support):
     for entry in (0, 32, 77, 140, 200, ENTRIES):
         s = entry / ENTRIES
         sums = {
-            SHARE: layers(lambda z, t: scale * kernel(dim, np.array(np.hypot(z, t))), s), NORMAL: layers(lambda z, t: q(z, t) * z * z, s),
-            TANGENT: layers(lambda z, t: q(z, t) * t * t / (dim - 1), s), SPREAD: layers(lambda z, t: q(z, t) * (z * z + t * t), s),
+            SHARE: layers(lambda z, t: scale * kernel(dim, np.array(np.hypot(z, t))), s),
+            NORMAL: layers(lambda z, t: q(z, t) * z * z, s),
+            TANGENT: layers(lambda z, t: q(z, t) * t * t / (dim - 1), s),
+            SPREAD: layers(lambda z, t: q(z, t) * (z * z + t * t), s),
             SLOPE: layers(lambda z, t: -q(z, t) * z, s),
         }
         for column, value in sums.items():
@@ -696,9 +698,18 @@ def test_a_frame_may_take_as_many_steps_as_a_sliding_wall_asks_for():
 # -- refusals
 
 FAMILY = {
-    "name": "tiny", "dim": 2, "bounds": [[0.0, 1.0], [0.0, 1.0]], "gravity": [0.0, -9.8], "frame_step": 0.002, "frames": 5, "radius": 0.1,
-    "cells": [12, 12], "materials": {"water": {"model": "water", "sound_speed": 20.0, "viscosity": 1.0}}, "solver": {"method": "wcsph"},
-    "bodies": [{"material": "water", "shape": {"kind": "box", "size": [0.4, 0.3]}}], "splits": {"train": 2, "valid": 0, "test": 0},
+    "name": "tiny",
+    "dim": 2,
+    "bounds": [[0.0, 1.0], [0.0, 1.0]],
+    "gravity": [0.0, -9.8],
+    "frame_step": 0.002,
+    "frames": 5,
+    "radius": 0.1,
+    "cells": [12, 12],
+    "materials": {"water": {"model": "water", "sound_speed": 20.0, "viscosity": 1.0}},
+    "solver": {"method": "wcsph"},
+    "bodies": [{"material": "water", "shape": {"kind": "box", "size": [0.4, 0.3]}}],
+    "splits": {"train": 2, "valid": 0, "test": 0},
 }
 BALL = {"kind": "ball", "radius": 0.1, "count": [1, 1], "center": [0.2, 0.2]}
 REFUSED = {

@@ -31,9 +31,18 @@ def scene(method, bodies, wood=WOOD, water=WATER, solver=(), **changes):
     """A unit box of 16 cells; a body is (material, kind and geometry)."""
     dim = changes.get("dim", 2)
     content = {
-        "name": "test", "dim": dim, "bounds": [[0.0, 1.0]] * dim, "gravity": [0.0] * (dim - 1) + [-9.8], "frame_step": 0.005, "frames": 200,
-        "radius": 0.1, "cells": [16] * dim, "materials": {"wood": wood, "water": water}, "seed": 3,
-        "bodies": [{"material": name, "velocity": [0.0] * dim} | geometry for name, geometry in bodies], "solver": {"method": method} | dict(solver),
+        "name": "test",
+        "dim": dim,
+        "bounds": [[0.0, 1.0]] * dim,
+        "gravity": [0.0] * (dim - 1) + [-9.8],
+        "frame_step": 0.005,
+        "frames": 200,
+        "radius": 0.1,
+        "cells": [16] * dim,
+        "materials": {"wood": wood, "water": water},
+        "seed": 3,
+        "bodies": [{"material": name, "velocity": [0.0] * dim} | geometry for name, geometry in bodies],
+        "solver": {"method": method} | dict(solver),
     }
     return Scene.from_dict(content | changes)
 
@@ -42,8 +51,13 @@ def motion(solver):
     """Of the first body: centre [length, from the lower corner], velocity, spin, mass over that of a particle of water, inertia [length^2] of it."""
     rigid, h = solver._kernels.rigid, solver._support
     mass = float(rigid.mass.to_numpy()[0]) * int(np.ptp(rigid.span.to_numpy()[0]))
-    return (rigid.centre.to_numpy()[0] * h, rigid.velocity.to_numpy()[0] * h, rigid.spin.to_numpy()[0], mass,
-            np.linalg.inv(rigid.inverse.to_numpy()[0].astype(float)) * h**2)
+    return (
+        rigid.centre.to_numpy()[0] * h,
+        rigid.velocity.to_numpy()[0] * h,
+        rigid.spin.to_numpy()[0],
+        mass,
+        np.linalg.inv(rigid.inverse.to_numpy()[0].astype(float)) * h**2,
+    )
 
 
 def momenta(solver, water):
@@ -63,8 +77,11 @@ def energy(solver):
 @pytest.mark.parametrize("method", METHODS)
 def test_a_body_and_the_water_on_it_fall_freely(solvers, method):
     """Touching: neither presses on the other. x0 + v0 t + g t^2 / 2 (WCSPH, velocity Verlet), g t (t + dt) / 2 (DFSPH, symplectic Euler)."""
-    what = scene(method, [("wood", box([0.375, 0.5], [0.625, 0.625], [0.2, 0.3])), ("water", box([0.375, 0.625], [0.625, 0.75], [0.2, 0.3]))],
-                 solver=STILL[method])
+    what = scene(
+        method,
+        [("wood", box([0.375, 0.5], [0.625, 0.625], [0.2, 0.3])), ("water", box([0.375, 0.625], [0.625, 0.75], [0.2, 0.3]))],
+        solver=STILL[method],
+    )
     solver = solvers[method, 2]
     solver.load(what)
     start, steps = what.particles().position, 0
@@ -108,8 +125,12 @@ def test_momenta_of_a_body_struck_by_water(solvers, method, dim, viscosity):
 @pytest.mark.parametrize("method", METHODS)
 def test_densities_1000_to_1(solvers, method, density):
     """Water at 2 m/s strikes a body a thousand times lighter or heavier: finite, momentum to rounding, no energy gained, no water in it."""
-    what = scene(method, [("water", box([0.125, 0.375], [0.4375, 0.625], [2.0, 0.0])), ("wood", box([0.5, 0.4375], [0.625, 0.5625]))],
-                 wood=WOOD | {"density": density}, gravity=[0.0, 0.0])
+    what = scene(
+        method,
+        [("water", box([0.125, 0.375], [0.4375, 0.625], [2.0, 0.0])), ("wood", box([0.5, 0.4375], [0.625, 0.5625]))],
+        wood=WOOD | {"density": density},
+        gravity=[0.0, 0.0],
+    )
     solver = solvers[method, 2]
     solver.load(what)
     water = what.particles().material == 1
@@ -139,8 +160,14 @@ def inside(solver, water):
 @pytest.mark.parametrize("method", METHODS)
 def test_a_body_rests_on_the_floor_and_a_stone_on_another(solvers, method):
     """Out of the water's reach: contacts are those of MPM. They fall, do not bounce, and lie on their faces."""
-    what = scene(method, [("water", box([0.0, 0.0], [0.0625, 0.0625])), ("wood", box([0.625, 0.0625], [0.875, 0.1875])),
-                          ("wood", box([0.6875, 0.25], [0.8125, 0.375]))])
+    what = scene(
+        method,
+        [
+            ("water", box([0.0, 0.0], [0.0625, 0.0625])),
+            ("wood", box([0.625, 0.0625], [0.875, 0.1875])),
+            ("wood", box([0.6875, 0.25], [0.8125, 0.375])),
+        ],
+    )
     solver = solvers[method, 2]
     solver.load(what)
     for _ in range(80):
@@ -156,9 +183,18 @@ def test_a_plate_drags_viscous_water_along():
     """Couette: a heavy plate across a periodic box slides over a layer of water on sticky walls; u = U y / H at 1.5 H^2 / nu. By DFSPH: WCSPH, with a
     wall in the plate's place too, gains a fifth of its density in so viscous a shear."""
     layer, speed, nu = 0.25, 0.5, 0.2
-    what = scene("dfsph", [("water", box([0.0, 0.0], [0.5, layer])), ("wood", box([0.0, layer], [0.5, 0.375], [speed, 0.0]))],
-                 wood=WOOD | {"density": 1e6}, water=WATER | {"viscosity": 1000.0 * nu}, gravity=[0.0, 0.0], bounds=[[0.0, 0.5], [0.0, 0.5]],
-                 periodic=["x"], walls={"friction": "sticky"}, frame_step=0.01, solver={"iterations": 1000})
+    what = scene(
+        "dfsph",
+        [("water", box([0.0, 0.0], [0.5, layer])), ("wood", box([0.0, layer], [0.5, 0.375], [speed, 0.0]))],
+        wood=WOOD | {"density": 1e6},
+        water=WATER | {"viscosity": 1000.0 * nu},
+        gravity=[0.0, 0.0],
+        bounds=[[0.0, 0.5], [0.0, 0.5]],
+        periodic=["x"],
+        walls={"friction": "sticky"},
+        frame_step=0.01,
+        solver={"iterations": 1000},
+    )
     solver = SPHSimulator()
     solver.load(what)
     for _ in range(round(1.5 * layer**2 / nu / what.frame_step)):
@@ -198,8 +234,9 @@ def test_rigid_bodies_are_built_only_where_they_are(built, method):
     without = wet.plan(scene(method, [("water", box([0.0, 0.0], [1.0, 0.25]))]))
     assert "rigid bodies" in without["left_out"] and not any("rigid" in name or "contact" in name for name in without["fields"])
     for viscosity in (0.0, 1.0):
-        what = scene(method, [("water", box([0.0, 0.0], [1.0, 0.25])), ("wood", box([0.375, 0.25], [0.625, 0.375]))],
-                     water=WATER | {"viscosity": viscosity})
+        what = scene(
+            method, [("water", box([0.0, 0.0], [1.0, 0.25])), ("wood", box([0.375, 0.25], [0.625, 0.375]))], water=WATER | {"viscosity": viscosity}
+        )
         rigid = {name: entry for name, entry in wet.plan(what)["fields"].items() if "rigid" in name or "contact" in name}
         structure, particles = wet._structure(what), len(what.particles().position)
         sizes = wet._sizes(what, structure, particles, particles - wet._water_first(what, what.particles())[1])

@@ -124,8 +124,10 @@ def test_a_solve_that_fails_in_silence_is_found_wrong(monkeypatch):
 def test_a_refusal_that_is_missing_is_found_wrong(monkeypatch):
     for solver in (MPMSimulator, SPHSimulator, PBDSimulator):
         monkeypatch.setattr(solver, "check_time_step", lambda *_: None)
-    monkeypatch.setattr("sim.generate.generate", lambda *_, **__: {"splits": {"train": {
-        "ok": 2, "trajectories": 2, "failed": [], "cost": {"wall_seconds": 0.0, "compile_seconds": 0.0}}}})
+    monkeypatch.setattr(
+        "sim.generate.generate",
+        lambda *_, **__: {"splits": {"train": {"ok": 2, "trajectories": 2, "failed": [], "cost": {"wall_seconds": 0.0, "compile_seconds": 0.0}}}},
+    )
     assert [cell.cell for cell in case("refusal").run() if cell.right] == ["dfsph, radius below the spacing"], "whose reason is another one"
 
 

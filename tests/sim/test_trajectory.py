@@ -19,9 +19,15 @@ from sim.trajectory import ShardReader, Trajectory, atomic_path, write_json, wri
 def trajectory(frames=20, particles=30, dim=2, seed=0, **changes):
     rng = np.random.default_rng(seed)
     fields = {
-        "position": rng.random((frames, particles, dim)).astype(np.float32), "particle_type": rng.choice([3, 5, 6], particles).astype(np.int8),
-        "frame_step": 0.0025, "radius": 0.015, "bounds": np.array([[0.1, 0.9]] * dim), "scene": {"name": "made up", "gravity": [0.0, -9.8]},
-        "seed": 2**53 - 1, "simulator": {"name": "none"}, "context": rng.random((frames, 2)).astype(np.float32),
+        "position": rng.random((frames, particles, dim)).astype(np.float32),
+        "particle_type": rng.choice([3, 5, 6], particles).astype(np.int8),
+        "frame_step": 0.0025,
+        "radius": 0.015,
+        "bounds": np.array([[0.1, 0.9]] * dim),
+        "scene": {"name": "made up", "gravity": [0.0, -9.8]},
+        "seed": 2**53 - 1,
+        "simulator": {"name": "none"},
+        "context": rng.random((frames, 2)).astype(np.float32),
         "diagnostics": {"kinetic_energy": rng.random(frames), "substeps": np.ones(frames)},
     }
     return Trajectory(**(fields | changes))

@@ -5,8 +5,15 @@ import json
 from sim.scene import SceneFamily
 
 FAMILY = {
-    "name": "tiny", "dim": 2, "bounds": [[0.0, 1.0], [0.0, 1.0]], "gravity": [0.0, -9.8], "frame_step": 0.01, "frames": 12, "radius": 0.1,
-    "cells": [16, 16], "materials": {"water": {"model": "water", "sound_speed": 5.0}},
+    "name": "tiny",
+    "dim": 2,
+    "bounds": [[0.0, 1.0], [0.0, 1.0]],
+    "gravity": [0.0, -9.8],
+    "frame_step": 0.01,
+    "frames": 12,
+    "radius": 0.1,
+    "cells": [16, 16],
+    "materials": {"water": {"model": "water", "sound_speed": 5.0}},
     "bodies": [{"material": "water", "shape": {"kind": "box", "size": [[0.2, 0.4], [0.2, 0.4]]}, "velocity": [[-1, 1], [-1, 1]]}],
     "splits": {"train": 6, "valid": 2, "test": 2},
 }

@@ -81,8 +81,18 @@ def look(page: str, folder: Path, width: int) -> Seen:
     with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server, log.open("wb") as output:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         command = [
-            BROWSER, "--headless", "--no-sandbox", "--disable-gpu", "--disable-extensions", "--disable-background-networking", "--no-first-run",
-            "--hide-scrollbars", f"--user-data-dir={folder / 'profile'}", "--enable-logging=stderr", "--v=0", "--window-size=1400,900",
+            BROWSER,
+            "--headless",
+            "--no-sandbox",
+            "--disable-gpu",
+            "--disable-extensions",
+            "--disable-background-networking",
+            "--no-first-run",
+            "--hide-scrollbars",
+            f"--user-data-dir={folder / 'profile'}",
+            "--enable-logging=stderr",
+            "--v=0",
+            "--window-size=1400,900",
             f"http://127.0.0.1:{server.server_port}/",
         ]
         process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=output, stderr=output, start_new_session=True)

@@ -90,7 +90,11 @@ def make_tree(folder: Path) -> Path:
 
 
 def begin_snakemake(
-    folder: Path, *options: str, study: str = "configs/studies/micro.yaml", program: tuple = ("-m", "snakemake"), environment: dict | None = None,
+    folder: Path,
+    *options: str,
+    study: str = "configs/studies/micro.yaml",
+    program: tuple = ("-m", "snakemake"),
+    environment: dict | None = None,
     stdout=subprocess.PIPE,
 ) -> subprocess.Popen:
     """Snakemake in a tree, in a process group of its own; on two cores, unless a profile is named."""
@@ -98,9 +102,7 @@ def begin_snakemake(
     environment = os.environ | {"SLUICE_TAICHI_CACHE": str(ROOT / ".taichi_cache")} | (environment or {})
     cores = () if "--workflow-profile" in options else ("--cores", "2")
     command = [sys.executable, *program, *cores, *options, "--config", f"study={study}"]
-    return subprocess.Popen(
-        command, cwd=folder, env=environment, text=True, stdout=stdout, stderr=subprocess.STDOUT, start_new_session=True
-    )
+    return subprocess.Popen(command, cwd=folder, env=environment, text=True, stdout=stdout, stderr=subprocess.STDOUT, start_new_session=True)
 
 
 def snakemake(folder: Path, *options: str, **settings) -> tuple[int, str]:

@@ -24,8 +24,17 @@ from disks import small_disk  # noqa: E402
 pytestmark = pytest.mark.workflow
 
 ROW_KEYS = {
-    "scene", "contender", "kind", "settings", "one_step_mse", "rollout_mse", "rollout_mse_moving", "seconds_per_frame",
-    "seconds_per_simulated_second", "compile_seconds", "spread",
+    "scene",
+    "contender",
+    "kind",
+    "settings",
+    "one_step_mse",
+    "rollout_mse",
+    "rollout_mse_moving",
+    "seconds_per_frame",
+    "seconds_per_simulated_second",
+    "compile_seconds",
+    "spread",
 }
 KINDS = {"reference": 1, "solver": 2, "learned": 2, "trivial": 5, "oracle": 1, "floor": 1}
 PICTURES = {"figures", "speed_ups", "film", "strip", "training_curve"}
@@ -129,10 +138,7 @@ EDITS = {
     "other solvers": (lambda tree: [append(tree / "sim" / name) for name in ("sph/wcsph.py", "sph/dfsph.py", "pbd/solver.py")], set()),
     "comment": (lambda tree: append(tree / "sim" / "mpm" / "solver.py", "\n# a comment\n"), set()),
     "network": (lambda tree: append(tree / "learn" / "gns.py"), {"train", "errors", "timing", "rollouts", "report", *PICTURES}),
-    "grid emulator": (
-        lambda tree: append(tree / "learn" / "grid_emulator.py"),
-        {"train", "errors", "timing", "rollouts", "report", *PICTURES},
-    ),
+    "grid emulator": (lambda tree: append(tree / "learn" / "grid_emulator.py"), {"train", "errors", "timing", "rollouts", "report", *PICTURES}),
     "metrics": (lambda tree: append(tree / "learn" / "metrics.py"), {"train", "errors", "timing", "rollouts", "report", *PICTURES}),
     "scene": (
         lambda tree: replace(tree / "configs" / "scenes" / "puddle.yaml", "sound_speed: 6.0", "sound_speed: 7.0"),
@@ -293,7 +299,8 @@ def test_the_report_on_a_full_disk(finished, tmp_path):
     with small_disk(disk) as leave:
         summary, page, entry = ((made / name).stat().st_size for name in ("summary.json", "report/puddle.html", "report.html"))
         for free, name, left in (
-            (4096, "summary.json", []), (summary + page // 2, "report", ["summary.json"]),
+            (4096, "summary.json", []),
+            (summary + page // 2, "report", ["summary.json"]),
             (page + entry // 2, "report.html", ["summary.json", "report"]),  # the summary is there, and makes way for its like
         ):
             leave(free)

@@ -239,7 +239,12 @@ def test_the_paper_study_is_the_papers_size(monkeypatch):
     assert set(study.data) == set(study.comparisons) == set(DOMAINS)
     for name, domain in DOMAINS.items():
         entry, family = study.data[name], study.families[name].model
-        assert (entry["train"], family.frames - 1, family.radius, family.frame_step) == (domain.trajectories, domain.steps, domain.radius, domain.frame_step)
+        assert (entry["train"], family.frames - 1, family.radius, family.frame_step) == (
+            domain.trajectories,
+            domain.steps,
+            domain.radius,
+            domain.frame_step,
+        )
         assert entry["valid"] == entry["test"] == HELD_OUT.get(name, 100)
         assert study.comparisons[name]["learned"] == [f"{name}_gns"]
         (model,) = study.comparisons[name]["learned"]

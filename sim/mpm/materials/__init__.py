@@ -19,6 +19,4 @@ from sim.mpm.materials.snow import SnowModel
 from sim.mpm.materials.water import WaterModel
 
 #: name -> class. Any: a contract of Taichi functions, which no protocol describes.
-MODELS: dict[str, Any] = {
-    "water": WaterModel, "sand": SandModel, "goop": GoopModel, "elastic": ElasticModel, "snow": SnowModel, "rigid": RigidModel,
-}
+MODELS: dict[str, Any] = {"water": WaterModel, "sand": SandModel, "goop": GoopModel, "elastic": ElasticModel, "snow": SnowModel, "rigid": RigidModel}
