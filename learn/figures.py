@@ -22,7 +22,8 @@ from matplotlib.axes import Axes  # noqa: E402
 from matplotlib.colors import to_rgb  # noqa: E402
 from matplotlib.figure import Figure  # noqa: E402
 
-from learn.compare import MOVING_MSE, PARTICLES, SCENE, Yardstick, pareto_front  # noqa: E402
+from learn.analysis import MOVING_MSE, Yardstick, pareto_front  # noqa: E402
+from learn.compare import PARTICLES, SCENE  # noqa: E402
 from learn.generalisation import Trial, groups, trials  # noqa: E402
 from sim.errors import InputError  # noqa: E402
 from sim.trajectory import atomic_path  # noqa: E402
@@ -250,7 +251,7 @@ _OUTCOMES = {"wins": ("s", "learned"), "ties": ("D", "learned"), "loses": ("v", 
 def speed_ups(analysis: Sequence[dict], path: str | Path) -> None:
     """Every learned contender of all scenes, a line each: its speed-up at equal error, filled, and over the reference, accuracy aside, hollow.
 
-    analysis: by ``learn.compare.analyse``, of rows whose run times are interleaved. Right of 1 the model is the faster one.
+    analysis: by ``learn.analysis.analyse``, of rows whose run times are interleaved. Right of 1 the model is the faster one.
     """
     with plt.rc_context(_STYLE):
         figure, axes = plt.subplots(figsize=(8.5, 1.4 + 0.27 * len(analysis)), layout="constrained")

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from learn.compare import MOVING_MSE, PARTICLES, SCENE, Yardstick
+from learn.analysis import MOVING_MSE, Yardstick
+from learn.compare import PARTICLES, SCENE
 
 
 @dataclass(frozen=True)

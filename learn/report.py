@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from itertools import groupby
 from pathlib import Path
 
-from learn.compare import MOVING_MSE, analyse, best_learned, by_scene, over_floor, pareto_front, scene_verdict
+from learn.analysis import MOVING_MSE, analyse, best_learned, by_scene, over_floor, pareto_front, scene_verdict
 from learn.units import duration, number
 from sim.domains import DOMAINS, PARAMETERS, TRAINING_STEPS, reproduced
 from sim.errors import InputError
@@ -489,7 +489,7 @@ def write_report(summary: Mapping, path: str | Path, assets: Mapping[str, SceneA
     if not rows:
         raise InputError(path, "summary.rows", rows, "a report needs at least one row; run the comparison first")
     if not summary.get("verdict"):
-        raise InputError(path, "summary.verdict", summary.get("verdict"), "a report begins with its verdict; make it by learn.compare.verdict")
+        raise InputError(path, "summary.verdict", summary.get("verdict"), "a report begins with its verdict; make it by learn.analysis.verdict")
     title, folder = summary.get("title", "Learned simulators against their teacher"), path.with_suffix("")
     scenes = _scenes(rows, summary["analysis"] if "analysis" in summary else analyse(rows))
     left = dict(assets or {})

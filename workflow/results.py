@@ -9,7 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from learn.compare import PARTICLES, SCENE, Target, Yardstick, analyse, verdict
+from learn.analysis import Target, Yardstick, analyse, verdict
+from learn.compare import PARTICLES, SCENE
 from learn.generalisation import groups, trials
 from learn.report import Asset, SceneAssets
 from learn.units import number

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from learn import analysis as a
 from learn import compare as c
 from learn.baselines import Baseline, ConstantVelocity, Frozen, Oracle
 from sim.simulator import SimulationError
@@ -257,13 +258,13 @@ TRIVIAL = [row("frozen", "trivial", 1.0, 1e-6), row("ballistic", "trivial", 0.1,
 def test_model_that_never_wins():
     model = row("gns", "learned", 1e-3, 8.0, cost={"generation_seconds": 60.0, "training_seconds": 600.0, "trajectories": 50})
     rows = [*LADDER, *TRIVIAL, model]
-    assert c.speed_up_paper(rows, model) == pytest.approx(1.25)
-    assert c.speed_up_at_equal_error(rows, model) == {"ratio": 0.125, "rung": "coarse", "rung_kind": "solver", "outcome": "loses"}
-    assert c.error_at_equal_time(rows, model) == {"rung": "fine", "error": 1e-6, "ratio": pytest.approx(1000)}
-    (result,) = c.analyse(rows)
+    assert a.speed_up_paper(rows, model) == pytest.approx(1.25)
+    assert a.speed_up_at_equal_error(rows, model) == {"ratio": 0.125, "rung": "coarse", "rung_kind": "solver", "outcome": "loses"}
+    assert a.error_at_equal_time(rows, model) == {"rung": "fine", "error": 1e-6, "ratio": pytest.approx(1000)}
+    (result,) = a.analyse(rows)
     assert result["break_even"] == "never" and result["break_even_reference"] == pytest.approx(660 / 200) and not result["pareto"]
     assert result["worse_than_trivial"] == []
-    text = c.verdict(rows)
+    text = a.verdict(rows)
     assert text.startswith(
         "On sand (10 test trajectories of 100 predicted frames, truth: teacher, error: rollout MSE of moving particles over all frames), "
         "no learned model wins at equal error; the solver is 8 times faster than the best, gns"
@@ -275,63 +276,63 @@ def test_model_that_wins():
     model = row("gns", "learned", 5e-5, 0.8, cost={"generation_seconds": 40.0, "training_seconds": 600.0})
     other = row("slow gns", "learned", 5e-5, 8.0)
     rows = [*LADDER, *TRIVIAL, other, model]
-    equal = c.speed_up_at_equal_error(rows, model)
+    equal = a.speed_up_at_equal_error(rows, model)
     assert equal == {"ratio": pytest.approx(5.0), "rung": "fine", "rung_kind": "solver", "outcome": "wins"}
-    assert c.error_at_equal_time(rows, model)["rung"] == "worst" and c.error_at_equal_time(rows, model)["ratio"] == pytest.approx(5e-3)
-    result = c.analyse(rows)[1]
+    assert a.error_at_equal_time(rows, model)["rung"] == "worst" and a.error_at_equal_time(rows, model)["ratio"] == pytest.approx(5e-3)
+    result = a.analyse(rows)[1]
     assert result["break_even"] == pytest.approx(640 / (320)) and result["pareto"]
-    text = c.verdict(rows)
+    text = a.verdict(rows)
     assert "gns wins at equal error, 5 times faster than the solver" in text and "paid back at equal error after 2 rollouts" in text
 
 
 def test_only_the_reference_is_accurate_enough():
     model = row("gns", "learned", 1e-8, 2.0)
-    equal = c.speed_up_at_equal_error([*LADDER, model], model)
+    equal = a.speed_up_at_equal_error([*LADDER, model], model)
     assert (equal["rung"], equal["rung_kind"], equal["ratio"], equal["outcome"]) == ("teacher", "reference", 5.0, "wins")
-    assert "it is the reference itself: no cheaper rung reaches that error" in c.verdict([*LADDER, model])
+    assert "it is the reference itself: no cheaper rung reaches that error" in a.verdict([*LADDER, model])
 
 
 def test_no_rung_at_all():
     model = row("gns", "learned", 1e-8, 2.0)
     rows = [*LADDER[1:], model]
-    assert c.speed_up_at_equal_error(rows, model)["outcome"] == "no rung" and c.speed_up_paper(rows, model) is None
-    assert "no speed-up at equal error is defined" in c.verdict(rows)
+    assert a.speed_up_at_equal_error(rows, model)["outcome"] == "no rung" and a.speed_up_paper(rows, model) is None
+    assert "no speed-up at equal error is defined" in a.verdict(rows)
     slow = row("cheap", "learned", 1e-3, 0.1)
-    assert c.error_at_equal_time(rows, slow) == {"rung": None, "error": None, "ratio": None}
+    assert a.error_at_equal_time(rows, slow) == {"rung": None, "error": None, "ratio": None}
 
 
 def test_equal_time_with_the_reference():
     model = row("gns", "learned", 1e-3, 20.0)
-    assert c.error_at_equal_time([*LADDER, model], model) == {"rung": "teacher", "error": 0.0, "ratio": None}
+    assert a.error_at_equal_time([*LADDER, model], model) == {"rung": "teacher", "error": 0.0, "ratio": None}
 
 
 def test_a_tie_within_the_spread():
     model = row("gns", "learned", 1e-3, 0.9, spread=0.2)
-    assert c.speed_up_at_equal_error([*LADDER, model], model)["outcome"] == "ties"
-    assert "no learned model wins at equal error; gns ties" in c.verdict([*LADDER, model])
+    assert a.speed_up_at_equal_error([*LADDER, model], model)["outcome"] == "ties"
+    assert "no learned model wins at equal error; gns ties" in a.verdict([*LADDER, model])
 
 
 def test_failures_win_nothing():
     failed = row("gns", "learned", 1e-8, 0.1, failures=2)
     broken_rung = row("broken", "solver", 1e-8, 0.01, failures=1)
     rows = [*LADDER, broken_rung, failed]
-    assert c.speed_up_at_equal_error(rows, failed)["outcome"] == "failed"
-    text = c.verdict(rows)
+    assert a.speed_up_at_equal_error(rows, failed)["outcome"] == "failed"
+    text = a.verdict(rows)
     assert "no learned model wins: none finished every rollout." in text and "gns (learned) failed in 2 of 10" in text
     assert "broken (solver) failed in 1 of 10" in text
     model = row("other", "learned", 1e-8, 1.0)
-    assert c.speed_up_at_equal_error([*rows, model], model)["rung"] == "teacher"
-    assert [point["contender"] for point in c.pareto_front([*rows, model])] == ["worst", "other", "teacher"]
+    assert a.speed_up_at_equal_error([*rows, model], model)["rung"] == "teacher"
+    assert [point["contender"] for point in a.pareto_front([*rows, model])] == ["worst", "other", "teacher"]
 
 
 def test_worse_than_trivial_cannot_win():
     model = row("gns", "learned", 0.5, 0.1)
     nothing = row("dead", "learned", None, 0.1, failures=10)
     rows = [*LADDER, *TRIVIAL, model, nothing]
-    assert c.worse_than_trivial(rows, model) == ["ballistic"] and c.worse_than_trivial(rows, nothing) == ["frozen", "ballistic"]
-    equal = c.speed_up_at_equal_error(rows, model)
+    assert a.worse_than_trivial(rows, model) == ["ballistic"] and a.worse_than_trivial(rows, nothing) == ["frozen", "ballistic"]
+    equal = a.speed_up_at_equal_error(rows, model)
     assert equal["ratio"] == pytest.approx(5.0) and equal["outcome"] == "worse than trivial"
-    text = c.verdict(rows)
+    text = a.verdict(rows)
     assert "no learned model wins: gns" in text and "worse than the trivial ballistic" in text and " wins at equal error" not in text
 
 
@@ -339,17 +340,17 @@ def test_chaos_floor():
     floor = row("perturbed", "floor", 2e-4, 10.0)
     model = row("gns", "learned", 5e-5, 2.0)
     rows = [*LADDER, floor, model]
-    assert c.over_floor(rows, model) == {"20": 0.25, "all": 0.25} and c.over_floor(LADDER, TEACHER) == {"20": None, "all": None}
+    assert a.over_floor(rows, model) == {"20": 0.25, "all": 0.25} and a.over_floor(LADDER, TEACHER) == {"20": None, "all": None}
     # Below the floor errors mean nothing: "coarse" (1e-4) counts as accurate as the model (5e-5).
-    assert c.speed_up_at_equal_error(rows, model)["rung"] == "coarse"
-    assert "0.25 times the chaos floor" in c.verdict(rows)
+    assert a.speed_up_at_equal_error(rows, model)["rung"] == "coarse"
+    assert "0.25 times the chaos floor" in a.verdict(rows)
 
 
 def test_references_and_scenes_are_kept_apart():
     model = row("gns", "learned", 1e-3, 8.0, reference="fine teacher")
     elsewhere = row("rung", "solver", 1e-9, 0.1, scene="water", reference="fine teacher")
-    assert c.speed_up_at_equal_error([*LADDER, elsewhere, model], model)["outcome"] == "no rung"
-    text = c.verdict([*LADDER, elsewhere, model])
+    assert a.speed_up_at_equal_error([*LADDER, elsewhere, model], model)["outcome"] == "no rung"
+    text = a.verdict([*LADDER, elsewhere, model])
     assert text.startswith("No learned model wins at equal error (rollout MSE of moving particles over all frames) on any of the 3 scenes. On sand (")
     assert "On sand (truth: fine teacher) no solver rung that was timed is as accurate." in text
     assert "On sand (truth: teacher) and water no learned model was compared." in text
@@ -361,7 +362,7 @@ def elsewhere(scene, *rows):
 
 def test_the_verdict_on_several_scenes_counts():
     loses = elsewhere("sand", row("gns", "learned", 1e-3, 8.0)) + elsewhere("goop", row("grid", "learned", 1e-3, 2.0))
-    text = c.verdict(loses)
+    text = a.verdict(loses)
     assert text.startswith("No learned model wins at equal error (rollout MSE of moving particles over all frames) on any of the 2 scenes.")
     assert text.endswith("On 2 the best loses to the solver, by the least on goop, where grid takes 2 times as long.")
     more = (
@@ -370,8 +371,8 @@ def test_the_verdict_on_several_scenes_counts():
         + elsewhere("jelly", row("gns", "learned", None, 0.1, failures=10))
         + elsewhere("mud", row("gns", "learned", 1e-3, 0.9, spread=0.2))
     )
-    missed = c.Target("snow", "gns", c.MOVING_MSE, high=0.1)
-    text = c.verdict(loses + more, [missed])
+    missed = a.Target("snow", "gns", a.MOVING_MSE, high=0.1)
+    text = a.verdict(loses + more, [missed])
     assert text.startswith(
         "At equal error (rollout MSE of moving particles over all frames) a learned model wins on 1 of 6 scenes: gns on water, 5 times faster than "
         "the solver. On 2 the solver is faster, by the least on goop, where grid takes 2 times as long. On mud the best ties with the solver"
@@ -380,24 +381,24 @@ def test_the_verdict_on_several_scenes_counts():
 
 
 def test_other_yardsticks():
-    end = c.Yardstick("emd", "1")
-    assert end.of(TEACHER) == 2.0 and str(end) == "EMD at the end" and str(c.Yardstick("emd", "0.5")) == "EMD at 50% of the run"
-    mean = c.Yardstick("emd", "1", over="mean")
+    end = a.Yardstick("emd", "1")
+    assert end.of(TEACHER) == 2.0 and str(end) == "EMD at the end" and str(a.Yardstick("emd", "0.5")) == "EMD at 50% of the run"
+    mean = a.Yardstick("emd", "1", over="mean")
     assert mean.of(TEACHER | {"mean": {"emd": {"1": 3.0}}}) == 3.0 and str(mean) == "mean EMD at the end"
-    assert str(c.Yardstick("one_step_mse", None)) == "one step MSE" and str(c.Yardstick("rollout_mse", "20")) == "rollout MSE over 20 frames"
+    assert str(a.Yardstick("one_step_mse", None)) == "one step MSE" and str(a.Yardstick("rollout_mse", "20")) == "rollout MSE over 20 frames"
 
 
 def test_targets():
     model = row("gns", "learned", 1e-3, 8.0)
     rows = [*TRIVIAL, model]
-    reached = c.Target("sand", "gns", c.MOVING_MSE, high=0.2, relative_to="ballistic")
-    missed = c.missed_targets(
+    reached = a.Target("sand", "gns", a.MOVING_MSE, high=0.2, relative_to="ballistic")
+    missed = a.missed_targets(
         rows,
         [
             reached,
-            c.Target("sand", "gns", c.Yardstick("emd", "1"), high=1.5),
-            c.Target("sand", "gns", c.Yardstick("emd", "0.5"), low=1.5, high=3),
-            c.Target("sand", "none", c.MOVING_MSE, high=1),
+            a.Target("sand", "gns", a.Yardstick("emd", "1"), high=1.5),
+            a.Target("sand", "gns", a.Yardstick("emd", "0.5"), low=1.5, high=3),
+            a.Target("sand", "none", a.MOVING_MSE, high=1),
         ],
     )
     assert missed == [
@@ -405,13 +406,13 @@ def test_targets():
         "gns on sand: EMD at 50% of the run is 1, not at least 1.5",
         "none on sand: rollout MSE of moving particles over all frames is unknown",
     ]
-    assert c.verdict(rows, [reached]).endswith("The target of the study is reached.")
-    assert "Missed: none on sand" in c.verdict(rows, [c.Target("sand", "none", c.MOVING_MSE, high=1)])
+    assert a.verdict(rows, [reached]).endswith("The target of the study is reached.")
+    assert "Missed: none on sand" in a.verdict(rows, [a.Target("sand", "none", a.MOVING_MSE, high=1)])
 
 
 def test_break_even():
-    assert c.break_even(100.0, 3.0, 1.0) == 50 and c.break_even(100.0, 1.0, 1.0) == "never" and c.break_even(100.0, 1.0, 3.0) == "never"
+    assert a.break_even(100.0, 3.0, 1.0) == 50 and a.break_even(100.0, 1.0, 1.0) == "never" and a.break_even(100.0, 1.0, 3.0) == "never"
 
 
 def test_no_learned_model():
-    assert "no learned model was compared" in c.verdict(LADDER)
+    assert "no learned model was compared" in a.verdict(LADDER)

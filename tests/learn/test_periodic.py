@@ -9,6 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from learn import analysis as a
 from learn import compare as c
 from learn import metrics
 from learn.baselines import ConstantVelocity, Oracle, RigidDrop, trivial_baselines
@@ -295,7 +296,7 @@ def test_comparison():
     assert all(row["failures"] == 0 for row in rows.values())
     assert rows["oracle"]["rollout_mse"]["all"] < 1e-10 and rows["oracle"]["one_step_mse"] < 1e-10
     assert rows["constant velocity"]["one_step_mse"] < 1e-4 < rows["frozen"]["one_step_mse"] < 0.1
-    assert c.verdict(list(rows.values())).startswith("On channel")
+    assert a.verdict(list(rows.values())).startswith("On channel")
 
 
 def test_relaxation_pushes_across_a_face():

@@ -7,7 +7,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from learn import compare, report
+from learn import analysis, compare, report
 from learn.baselines import Frozen, Oracle
 from sim.errors import InputError
 from sim.trajectory import Trajectory
@@ -162,7 +162,7 @@ def test_the_entry_stands_alone_and_begins_with_the_verdict(tmp_path, rows, asse
 
 def test_the_page_of_a_scene_holds_all_of_it(tmp_path, rows, assets):
     text, page = write(tmp_path, rows, assets)
-    assert page.paragraphs[0] == compare.scene_verdict(rows)
+    assert page.paragraphs[0] == analysis.scene_verdict(rows)
     media = check_self_contained(text, page, 5)
     film = next(attributes for tag, attributes in page.tags if tag == "video")
     assert film["src"].startswith("data:video/mp4;base64,") and film["poster"].startswith("data:image/png;base64,")
@@ -184,7 +184,7 @@ def test_pages_are_linked_both_ways(tmp_path, rows):
     for page in pages:
         _, other = write(tmp_path, rows, page=page)
         assert set(links(other)) == {f"../report.html#{page}", "../report.html#provenance", *(f"{each}.html" for each in pages - {page})}
-    assert text.count(compare.scene_verdict(rows[:7])) == 1  # among several scenes each has its verdict in the entry as well
+    assert text.count(analysis.scene_verdict(rows[:7])) == 1  # among several scenes each has its verdict in the entry as well
 
 
 def test_pages_of_an_earlier_report_go(tmp_path, rows):
@@ -197,7 +197,7 @@ def test_scenes_at_a_glance(tmp_path, rows):
     failed = [row | {"scene": "mud"} for row in rows if row["contender"] != "gns"]
     text, page = write(tmp_path, rows + failed, page=None)
     table = page.table("At a glance; error: rollout MSE of moving particles over all frames")
-    trivial = compare.MOVING_MSE.of(next(row for row in rows if row["contender"] == "frozen"))
+    trivial = analysis.MOVING_MSE.of(next(row for row in rows if row["contender"] == "frozen"))
     assert table["hand"] == ["hand | truth: teacher", "gns", "4.0e-4", report.number(trivial), "3 ms", "0.33× | loses", "rung", "3×", "never"]
     assert table["mud"][1:] == ["–^1", *["–"] * 7] and "none finished every rollout" in text
     assert "None of these scenes is one of the sixteen domains" in text
@@ -284,9 +284,9 @@ def test_speed_ups_floor_and_costs(tmp_path, rows):
 
 
 def test_analysis_of_the_summary_is_used_as_it_is(tmp_path, rows):
-    analysis = compare.analyse(rows)
-    analysis[0] |= {"speed_up_paper": 42.0, "worse_than_trivial": ["frozen"]}
-    _, page = write(tmp_path, rows, analysis=analysis)
+    analysed = analysis.analyse(rows)
+    analysed[0] |= {"speed_up_paper": 42.0, "worse_than_trivial": ["frozen"]}
+    _, page = write(tmp_path, rows, analysis=analysed)
     gns = page.table("What the learning bought")["gns"]
     assert gns[1] == "42×" and gns[0] == "gns | worse than frozen"
 

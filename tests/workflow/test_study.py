@@ -334,6 +334,7 @@ EDITS = [
     ("learn/train.py", None, LEARNED),
     ("learn/metrics.py", None, {*LEARNED, *COMPARED, "report"}),  # trainings choose their best weights by it
     ("learn/compare.py", None, COMPARED | {"report"}),
+    ("learn/analysis.py", None, {"report"}),
     ("learn/report_template.html", None, {"report"}),
     ("learn/scene_template.html", None, {"report"}),
     ("sim/page.css", None, {"report"}),

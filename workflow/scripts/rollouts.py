@@ -6,7 +6,7 @@ Filmed is the test trajectory on which the first film's contender has its median
 import json
 from pathlib import Path
 
-from learn.compare import median_trajectory
+from learn.analysis import median_trajectory
 from learn.rollout import rollout_trajectory
 from sim.trajectory import write_shard
 from workflow.command import run

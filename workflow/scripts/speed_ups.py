@@ -1,6 +1,6 @@
 """Figure of the speed-ups of all comparisons. ``python -m workflow.scripts.speed_ups FIGURE ROWS TIMING [ROWS TIMING ...]``"""
 
-from learn.compare import analyse
+from learn.analysis import analyse
 from learn.figures import speed_ups
 from workflow.command import run
 from workflow.rows import timed_rows
