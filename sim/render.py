@@ -532,8 +532,19 @@ def _failure(position: np.ndarray) -> int | None:
     return int(np.argmax(lost)) if lost.any() else None
 
 
-def _several_kinds(trajectory: Trajectory) -> bool:
-    return len(np.unique(trajectory.particle_type[trajectory.moving])) > 1
+def _colouring(trajectory: Trajectory, position: np.ndarray, frames: np.ndarray) -> tuple[Callable[[np.ndarray, np.ndarray], np.ndarray], Scale]:
+    """How the particles of a trajectory and of its predictions are coloured: by type where several kinds move, else by speed.
+
+    Returns value(positions [n, particles, dim], frames [m]) -> [m, particles] and its scale, the limits of speed of ``position`` at ``frames``.
+    """
+    if len(np.unique(trajectory.particle_type[trajectory.moving])) > 1:
+        kind = trajectory.particle_type.astype(float)
+        return lambda _, chosen: np.tile(kind, (len(chosen), 1)), type_scale(trajectory.particle_type)
+
+    def speed(positions: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+        return speeds(positions, chosen, trajectory.frame_step, trajectory.moving)
+
+    return speed, speed_scale(speed(position, frames))
 
 
 def render_trajectory(path: str | Path, trajectory: Trajectory, *, width: int | None = None) -> None:
@@ -545,18 +556,13 @@ def render_trajectory(path: str | Path, trajectory: Trajectory, *, width: int | 
         render_strip(path, trajectory, width=width or 300)
         return
     frames = film_frames(len(trajectory.position))
-    if _several_kinds(trajectory):
-        scale = type_scale(trajectory.particle_type)
-        value = np.tile(trajectory.particle_type.astype(float), (len(frames), 1))
-    else:
-        value = speeds(trajectory.position, frames, trajectory.frame_step, trajectory.moving)
-        scale = speed_scale(value)
+    value, scale = _colouring(trajectory, trajectory.position, frames)
     seed = "" if trajectory.seed is None else f", seed {trajectory.seed}"
     name = f"{trajectory.scene.get('name', 'scene')}{seed}, {trajectory.simulator.get('name', 'solver')}"
     footers = [f"t = {frame * trajectory.frame_step:.3f} s" for frame in frames]
     if not trajectory.ok:
         footers[-1] += f"   {trajectory.status}"
-    pane = Pane(name, trajectory.position[frames], value, scale)
+    pane = Pane(name, trajectory.position[frames], value(trajectory.position, frames), scale)
     render_film(path, [pane], trajectory.bounds, particle_spacing(trajectory), footers=footers, width=width or 720, gravity=_gravity(trajectory))
 
 
@@ -572,41 +578,38 @@ def render_strip(
     count, step = len(trajectory.position), trajectory.frame_step
     chosen = np.linspace(first, count - 1, min(6, count - first)) if times is None else np.clip(np.asarray(times, float) / step, 0, count - 1)
     chosen = np.rint(chosen).astype(int)
-    if _several_kinds(trajectory) and not predictions:
-        truth = np.tile(trajectory.particle_type.astype(float), (len(chosen), 1))
-        scale = type_scale(trajectory.particle_type)
-    else:
-        truth = speeds(trajectory.position, chosen, step, trajectory.moving)
-        scale = speed_scale(truth)
+    value, scale = _colouring(trajectory, trajectory.position, chosen)
+    truth = value(trajectory.position, chosen)
     label = f"{name}, " if predictions else ""
-    panes = [Pane(f"{label}t = {k * step:.2f} s", trajectory.position[k][None], value[None], scale) for k, value in zip(chosen, truth, strict=True)]
+    panes = [Pane(f"{label}t = {k * step:.2f} s", trajectory.position[k][None], shown[None], scale) for k, shown in zip(chosen, truth, strict=True)]
     nowhere = np.full((1, *trajectory.position.shape[1:]), np.nan, np.float32)
     for row, position in (predictions or {}).items():
         inside = [int(k) - first for k in chosen]
         for k, i in zip(chosen, inside, strict=True):
             there = 0 <= i < len(position)
-            value = speeds(position, np.array([i]), step, trajectory.moving) if there else np.zeros((1, nowhere.shape[1]))
-            panes.append(Pane(f"{row}, t = {k * step:.2f} s", position[i][None] if there else nowhere, value, scale))
+            shown = value(position, np.array([i])) if there else np.zeros((1, nowhere.shape[1]))
+            panes.append(Pane(f"{row}, t = {k * step:.2f} s", position[i][None] if there else nowhere, shown, scale))
     render_still(path, panes, trajectory.bounds, particle_spacing(trajectory), columns=len(chosen), width=width, gravity=_gravity(trajectory))
 
 
 def comparison_panes(truth: Trajectory, prediction: np.ndarray, first: int, frames: np.ndarray, names: tuple[str, str]) -> list[Pane]:
     """Three panes, solver | model | error, at ``frames``: indices into ``prediction`` [frames, particles, dim], whose 0 is the truth's ``first``.
 
-    Solver and model share one speed scale, taken from the solver; the error is each predicted particle's distance to its true
-    place, in particle spacings. Limits are fixed over the whole prediction.
+    Solver and model are coloured alike, by type where several kinds move, else by speed on the solver's scale; the error is each
+    predicted particle's distance to its true place, in particle spacings. Limits are fixed over the whole prediction.
     """
-    true, step, spacing = truth.position[first : first + len(prediction)], truth.frame_step, particle_spacing(truth)
+    true, spacing = truth.position[first : first + len(prediction)], particle_spacing(truth)
 
     def error(chosen: np.ndarray) -> np.ndarray:
         distance = np.linalg.norm(prediction[chosen].astype(float) - true[chosen], axis=2)
         return np.where(truth.moving, distance / spacing, np.nan)
 
     clip = film_frames(len(prediction))  # a still has the limits of its film
-    speed, distance = speed_scale(speeds(true, clip, step, truth.moving)), error_scale(error(clip))
+    value, scale = _colouring(truth, true, clip)
+    distance = error_scale(error(clip))
     return [
-        Pane(names[0], true[frames], speeds(true, frames, step, truth.moving), speed),
-        Pane(names[1], prediction[frames], speeds(prediction, frames, step, truth.moving), speed),
+        Pane(names[0], true[frames], value(true, frames), scale),
+        Pane(names[1], prediction[frames], value(prediction, frames), scale),
         Pane("error", prediction[frames], error(frames), distance),
     ]
 

@@ -183,6 +183,17 @@ def test_kinds_have_their_colours_and_the_static_ones_are_grey(monkeypatch):
     assert tuple(seen["pane"].scale.colours(seen["pane"].value[0])[1]) == render.KINEMATIC_GREY
 
 
+def test_several_kinds_are_told_apart_beside_a_prediction_too(monkeypatch):
+    truth, seen = toy(types=[5, 6, 3]), []
+    solver, model, error = render.comparison_panes(truth, truth.position + np.float32(0.01), 0, np.arange(3), ("solver", "model"))
+    for pane in (solver, model):
+        assert (pane.value == truth.particle_type).all() and [name for name, _ in pane.scale.entries] == ["boundary", "water", "sand"]
+    assert not error.scale.entries and np.isnan(error.value[:, truth.particle_type == 3]).all()
+    monkeypatch.setattr(render, "render_still", lambda path, panes, *_, **__: seen.extend(panes))
+    render.render_strip("strip.png", truth, [0.0, 0.03], predictions={"model": truth.position})
+    assert len(seen) == 4 and all((pane.value == truth.particle_type).all() for pane in seen)
+
+
 def test_speed_is_a_backward_difference():
     position = np.zeros((4, 1, 2), np.float32)
     position[:, 0, 0] = [0.0, 0.1, 0.3, 0.6]
