@@ -150,14 +150,6 @@ def worse_than_trivial(rows: list[dict], row: dict, yardstick: Yardstick = MOVIN
     return [name for name, bound in trivial if bound is not None and (error is None or bound < error)]
 
 
-def median_trajectory(rows: list[dict], contender: str, yardstick: Yardstick = MOVING_MSE) -> int:
-    """Number of the test trajectory on which a contender errs as in the (lower) median, failures being worst; of its first training seed."""
-    runs = next(row for row in rows if row["contender"] == contender)["spread"]["per_trajectory"]
-    runs = [run for run in runs if run["model_seed"] == runs[0]["model_seed"]]
-    errors = [math.inf if (error := yardstick.of(run)) is None else error for run in runs]
-    return sorted(range(len(errors)), key=errors.__getitem__)[(len(errors) - 1) // 2]
-
-
 def over_floor(rows: Sequence[dict], row: dict, metric: str = "rollout_mse_moving") -> dict[str, float | None]:
     """Error over chaos floor per horizon: near 1 the rest is chance. None where there is no floor or it is zero."""
     floor = _floor(rows, row)

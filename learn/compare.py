@@ -240,6 +240,15 @@ def compare(contenders: Sequence[Simulator], trajectories: Sequence[Trajectory],
     return rows
 
 
+def median_trajectory(rows: list[dict], contender: str) -> int:
+    """Number of the test trajectory on which a contender's rollout MSE of moving particles is its (lower) median, failures being worst; of its first
+    training seed."""
+    runs = next(row for row in rows if row["contender"] == contender)["spread"]["per_trajectory"]
+    runs = [run for run in runs if run["model_seed"] == runs[0]["model_seed"]]
+    errors = [math.inf if (error := run["rollout_mse_moving"]["all"]) is None else error for run in runs]
+    return sorted(range(len(errors)), key=errors.__getitem__)[(len(errors) - 1) // 2]
+
+
 # Timing ---------------------------------------------------------------------------------------------------------------------
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import torch
 
 from learn.baselines import Oracle, trivial_baselines
@@ -9,6 +11,7 @@ from learn.checkpoint import load_model
 from learn.compare import CompareSettings
 from learn.dataset import Dataset
 from learn.rollout import check_fit
+from sim.errors import InputError
 from sim.ladder import solver_ladder
 from sim.simulator import Kind, Simulator
 from sim.trajectory import Trajectory
@@ -19,11 +22,18 @@ from workflow.study import Study, rung_settings
 PERTURBATION = 1e-6
 
 
-def test_trajectories(study: Study, comparison: str) -> list[Trajectory]:
-    """The first so many of the test split. Failed trajectories are in no shard, so there may be fewer than asked for."""
+def test_trajectories(study: Study, comparison: str, numbers: Iterable[int] | None = None) -> list[Trajectory]:
+    """The first so many of the test split, or of them those of ``numbers``. Failed ones are in no shard, so there may be fewer than asked for."""
     entry = study.comparisons[comparison]
     data = Dataset(study.data_folder(entry["data"], "test"), "test")
-    return [data.trajectory(number) for number in range(min(entry["trajectories"], len(data)))]
+    return [data.trajectory(number) for number in (range(min(entry["trajectories"], len(data))) if numbers is None else numbers)]
+
+
+def check_device(study: Study, comparison: str, device: str) -> None:
+    """``InputError`` where a comparison asks for a GPU that is not there."""
+    if device == "cuda" and not torch.cuda.is_available():
+        remedy = "this machine has no CUDA device that torch can use; leave it out"
+        raise InputError(study.path, f"comparisons.{comparison}.resources.gpus", 1, remedy)
 
 
 def learned(study: Study, comparison: str, model: str, device: str = "cpu") -> list[Simulator]:
@@ -38,14 +48,12 @@ def learned(study: Study, comparison: str, model: str, device: str = "cpu") -> l
         contender.name = model
         contender.settings = {**contender.settings, "model": type(contender).name} | ({} if seed is None else {"seed": seed})
         if device != "cpu":
-            contender.settings["device"] = device
+            contender.settings["rolled out on"] = torch.cuda.get_device_name()
         contenders.append(contender)
     return contenders
 
 
-def contenders(
-    study: Study, comparison: str, trajectories: list[Trajectory], kinds: tuple[str, ...], device: str = "cpu"
-) -> list[Simulator]:  # fmt: skip
+def contenders(study: Study, comparison: str, trajectories: list[Trajectory], kinds: tuple[str, ...], device: str = "cpu") -> list[Simulator]:
     """Contenders of the given kinds, the learned ones on ``device``."""
     entry = study.comparisons[comparison]
     rungs: list[tuple[str, Kind, dict]] = [(REFERENCE, "reference", {}), *((rung["name"], "solver", rung_settings(rung)) for rung in entry["ladder"])]

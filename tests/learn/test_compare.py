@@ -416,3 +416,14 @@ def test_break_even():
 
 def test_no_learned_model():
     assert "no learned model was compared" in a.verdict(LADDER)
+
+
+def test_the_trajectory_of_the_median_error():
+    def rows(*errors):
+        runs = [{"model_seed": 0, "rollout_mse_moving": {"all": error}} for error in errors]
+        other = {"model_seed": 1, "rollout_mse_moving": {"all": 0.0}}  # another training of it, which films do not show
+        return [{"contender": "gns", "spread": {"per_trajectory": [*runs, other]}}]
+
+    assert c.median_trajectory(rows(3.0, 1.0, 2.0), "gns") == 2
+    assert c.median_trajectory(rows(3.0, 1.0, 2.0, 4.0), "gns") == 2  # the lower of the two in the middle
+    assert c.median_trajectory(rows(None, 1.0, 2.0), "gns") == 2 and c.median_trajectory(rows(None, None, 2.0), "gns") == 0

@@ -13,8 +13,13 @@ def learned_models(wildcards):
 
 
 def asked(key, default):
-    """A resource of a comparison's errors, for the scheduler."""
+    """A resource of a comparison, for the scheduler."""
     return lambda wildcards: STUDY.resource("comparisons", wildcards.comparison, key, default)
+
+
+def device_of_rollouts(wildcards, resources):
+    """Of what is granted: rows say where they come from, but a GPU where there was none compares nothing again."""
+    return "cuda" if resources.gpu else "cpu"
 
 
 rule errors:
@@ -25,8 +30,7 @@ rule errors:
         f"{RESULTS}/comparisons/{{comparison}}/errors.json",
     params:
         recipe=lambda wildcards: STUDY.comparison_recipe(wildcards.comparison, ERROR_KEYS, "errors"),
-        # Of what is granted: no part of the result, so that a GPU where there was none compares nothing again.
-        device=lambda wildcards, resources: "cuda" if resources.gpu else "cpu",
+        device=device_of_rollouts,
     log:
         f"{RESULTS}/logs/errors/{{comparison}}.log",
     benchmark:
@@ -57,8 +61,8 @@ rule timing:
     # All cores, of which it uses one: a job beside it would be in its figures.
     threads: workflow.cores
     resources:
-        mem_mb=4000,
-        runtime=60,
+        mem_mb=asked("mem_mb", 4000),
+        runtime=asked("runtime", 60),
     message:
         "Timing the contenders on {wildcards.comparison}, alone on the machine"
     shell:

@@ -15,6 +15,7 @@ rule rollouts:
         directory(f"{RESULTS}/comparisons/{{comparison}}/rollouts"),
     params:
         recipe=lambda wildcards: STUDY.comparison_recipe(wildcards.comparison, ("learned", "films"), "rollouts"),
+        device=device_of_rollouts,
         shards=film_shards,
     log:
         f"{RESULTS}/logs/rollouts/{{comparison}}.log",
@@ -22,12 +23,13 @@ rule rollouts:
         f"{RESULTS}/benchmarks/rollouts/{{comparison}}.tsv"
     threads: 1
     resources:
-        mem_mb=4000,
-        runtime=60,
+        mem_mb=asked("mem_mb", 4000),
+        runtime=asked("runtime", 60),
+        gpu=asked("gpus", 0),
     message:
         "Rollouts to film on {wildcards.comparison}"
     shell:
-        "{PYTHON} -m workflow.scripts.rollouts {STUDY.path} {wildcards.comparison} {input.rows} {output}/truth.h5 {params.shards} > {log} 2>&1"
+        "{PYTHON} -m workflow.scripts.rollouts {STUDY.path} {wildcards.comparison} {params.device} {input.rows} {output}/truth.h5 {params.shards} > {log} 2>&1"
 
 
 rule film:
