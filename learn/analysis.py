@@ -211,25 +211,31 @@ class Target:
 
 
 def missed_targets(rows: list[dict], targets: Sequence[Target]) -> list[str]:
-    """One phrase per target that is not reached; a figure that is missing, or was never measured, is a target missed."""
+    """One phrase per target that is not reached, or for all that miss one limit of one figure; one that was never measured is a target missed."""
     found = {(row["scene"], row["contender"]): row for row in rows}
-    missed = []
+    missed: dict[tuple[str, str], list[tuple[str, str]]] = {}  # (figure, limit) -> (who, value)
     for target in targets:
         row = found.get((target.scene, target.contender))
         value = target.yardstick.of(row) if row else None
-        what = f"{target.contender} on {target.scene}: {target.yardstick}"
+        figure = str(target.yardstick)
         if target.relative_to is not None:
-            what += f" over that of {target.relative_to}"
+            figure += f" over that of {target.relative_to}"
             key, wanted = ("kind", "trivial") if target.relative_to == BEST_TRIVIAL else ("contender", target.relative_to)
             bases = [other for other in rows if other["scene"] == target.scene and other[key] == wanted]
             divisor = min((bound for base in bases if (bound := target.yardstick.of(base)) is not None), default=None)
             value = value / divisor if value is not None and divisor else None
-        if value is None:
-            missed.append(f"{what} is unknown")
-        elif not target.low <= value <= target.high:
-            limit = f"at most {target.high:.3g}" if value > target.high else f"at least {target.low:.3g}"
-            missed.append(f"{what} is {value:.3g}, not {limit}")
-    return missed
+        limit = f"at most {target.high:.3g}" if value is None or value > target.high else f"at least {target.low:.3g}"
+        if value is None or not target.low <= value <= target.high:
+            shown = "unknown" if value is None else f"{value:.3g}"
+            missed.setdefault((figure, limit), []).append((f"{target.contender} on {target.scene}", shown))
+    phrases = []
+    for (figure, limit), those in missed.items():
+        if len(those) == 1:
+            ((who, shown),) = those
+            phrases.append(f"{who}: {figure} is {shown}, not {limit}")
+        else:
+            phrases.append(f"{figure} is not {limit} but {', '.join(f'{shown} ({who})' for who, shown in those)}")
+    return phrases
 
 
 def _names(names: Sequence[str]) -> str:
