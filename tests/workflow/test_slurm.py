@@ -41,6 +41,9 @@ def smoke(cluster, tmp_path_factory):
     """The smoke study by SLURM, two of whose jobs were ended from outside, by ``scancel`` and by kill -9 of a process: (tree, output, what the killed
     training had logged)."""
     tree = make_tree(tmp_path_factory.mktemp("smoke") / "tree")
+    study = (tree / SMOKE).read_text()
+    assert study.count("    timing:") == 1
+    (tree / SMOKE).write_text(study.replace("    timing:", "    resources: {mem_mb: 3500, runtime: 30}\n    timing:"))
     results = tree / "results" / "smoke"
     settings = {"program": PROGRAM, "environment": cluster.environment, "study": SMOKE}
     with open(tree / "output", "w+") as output:
@@ -110,6 +113,9 @@ def test_jobs_ask_for_what_they_need(cluster, smoke):
     data, timing = asked(cluster, smoke[1], "learning_data"), asked(cluster, smoke[1], "timing")
     assert (data["NumCPUs"], data["MinMemoryNode"], data["TimeLimit"]) == ("2", "2000M", "01:00:00")
     assert data["OverSubscribe"] == "OK" and timing["OverSubscribe"] == "NO"  # a timing has its machine for itself
+    for rule in ("errors", "timing", "rollouts"):
+        job = asked(cluster, smoke[1], rule)
+        assert (job["MinMemoryNode"], job["TimeLimit"]) == ("3500M", "00:30:00"), rule
 
 
 BROKEN = MICRO_STUDY.replace("seeds: [0]}", "seeds: [0], resources: {gpus: 2, threads: 1, mem_mb: 3000, runtime: 90}}", 1)
