@@ -224,7 +224,8 @@ def missed_targets(rows: list[dict], targets: Sequence[Target]) -> list[str]:
             bases = [other for other in rows if other["scene"] == target.scene and other[key] == wanted]
             divisor = min((bound for base in bases if (bound := target.yardstick.of(base)) is not None), default=None)
             value = value / divisor if value is not None and divisor else None
-        limit = f"at most {target.high:.3g}" if value is None or value > target.high else f"at least {target.low:.3g}"
+        above = value > target.high if value is not None else target.high < math.inf
+        limit = f"at most {target.high:.3g}" if above else f"at least {target.low:.3g}"
         if value is None or not target.low <= value <= target.high:
             shown = "unknown" if value is None else f"{value:.3g}"
             missed.setdefault((figure, limit), []).append((f"{target.contender} on {target.scene}", shown))

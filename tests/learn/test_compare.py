@@ -400,12 +400,14 @@ def test_targets():
             a.Target("sand", "gns", a.Yardstick("emd", "0.5"), low=1.5, high=3),
             a.Target("sand", "none", a.MOVING_MSE, high=1),
             a.Target("sand", "ballistic", a.Yardstick("emd", "1"), high=1.5),
+            a.Target("sand", "none", a.Yardstick("emd", "1"), low=1.5),
         ],
     )
     assert missed == [
         "EMD at the end is not at most 1.5 but 2 (gns on sand), 2 (ballistic on sand)",
         "gns on sand: EMD at 50% of the run is 1, not at least 1.5",
         "none on sand: rollout MSE of moving particles over all frames is unknown, not at most 1",
+        "none on sand: EMD at the end is unknown, not at least 1.5",
     ]
     assert a.verdict(rows, [reached]).endswith("The target of the study is reached.")
     assert "Missed: none on sand" in a.verdict(rows, [a.Target("sand", "none", a.MOVING_MSE, high=1)])
