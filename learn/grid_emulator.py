@@ -14,7 +14,8 @@ One call, all lengths in box units and times in model frames (dt = 1):
     x_pj   = f_pj + sum_(k <= j) [ sum_i w_ip s_k u_ik + b_p (sum_i w_ip vbar_i - v_p) ],    b_p = sum_i w_ip b_i
 
 Materials that move have a density and a velocity field each, and a particle reads those of its own (as in NeuralMPM: where two meet, one field would
-make them one); kinematic particles, obstacles, are a density alone.
+make them one); kinematic particles, obstacles, are a density alone. One velocity field a material does not keep a body rigid,
+so in rollouts the particles of each rigid body take the nearest places that are a motion of its shape (learn/rigidity.py).
 
 Of other transfers, no blend (FLIP) has 1.5 to 8 times the rollout error, affine particles (APIC) do not help, and quadratic B-splines, better for
 water, are not settled (docs/studies.md, "Transfers of the grid emulator").
@@ -39,6 +40,7 @@ from learn.dataset import DataSpec, Windows
 from learn.features import random_walk_noise
 from learn.model import check_start
 from learn.relaxation import Relaxation, relax
+from learn.rigidity import matched, rigid_bodies
 from sim.errors import InputError
 from sim.simulator import Start
 from sim.trajectory import KINEMATIC_TYPE
@@ -448,6 +450,7 @@ class GridEmulator(nn.Module):
         self._kind = torch.as_tensor(start.particle_type, dtype=torch.int64, device=device)
         self._example = torch.zeros_like(self._kind)
         self._frame, self._bounds = start.present, np.asarray(start.bounds, np.float64)
+        self._bodies = [(body, known[-1, body]) for body in rigid_bodies(known[-1], start.particle_type, self.spec.spacing)]
         self._context = None if start.context is None else torch.as_tensor(start.context, dtype=torch.float32, device=device)
         self._kinematic = None if start.kinematic is None else torch.as_tensor(start.kinematic, dtype=torch.float32, device=device)
 
@@ -465,6 +468,8 @@ class GridEmulator(nn.Module):
             last = future[-1].cpu().numpy().astype(np.float64)
             moved = relax(last, self._bounds, self.spec.spacing, self.options.relaxation, fixed) - last
             future = future + torch.from_numpy(moved.astype(np.float32)).to(future.device) * (self.frame / len(future))[:, None]
+        for body, shape in self._bodies:
+            future[:, body] = torch.from_numpy(matched(future[:, body].cpu().numpy(), shape).astype(np.float32)).to(future.device)
         before = torch.cat([self._state[-1:], future[:-1]])
         self._state = torch.cat([self._state, future])[-self.options.history :]
         self._frame += stride * len(future)

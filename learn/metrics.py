@@ -14,6 +14,8 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist
 
 from sim import periodic
+from sim.obstacles import combine
+from sim.scene import Scene
 from sim.trajectory import Trajectory
 
 HORIZONS = (1, 5, 20, 100)
@@ -71,6 +73,24 @@ def escaped_fraction(position: np.ndarray, bounds: np.ndarray) -> np.ndarray:
     slack = 1e-6 * (bounds[:, 1] - bounds[:, 0])
     outside = ((position < bounds[:, 0] - slack) | (position > bounds[:, 1] + slack)).any(axis=2).mean(axis=1)
     return np.where(np.isfinite(position).all(axis=(1, 2)), outside, np.nan)
+
+
+#: Frames of a rollout, evenly spaced to its last, in which particles inside obstacles are looked for: distances to a mesh take seconds a million.
+_OBSTACLE_FRAMES = 100
+
+
+def penetrated_fraction(position: np.ndarray, obstacles: list, spacing: float) -> np.ndarray:
+    """Share of the particles more than half a spacing inside an obstacle, in every frame: [frames]; NaN in non-finite frames.
+
+    position [frames, particles, dim]; obstacles: at least one, see ``sim.scene.Scene.surfaces``. A particle that rests on a face is less deep.
+    """
+    position = np.asarray(position, float)
+    finite = np.isfinite(position).all(axis=(1, 2))
+    inside = np.full(len(position), np.nan)
+    if finite.any():
+        distance, _, _ = combine(obstacles, position[finite].reshape(-1, position.shape[2]))
+        inside[finite] = (distance < -spacing / 2).reshape(-1, position.shape[1]).mean(axis=1)
+    return inside
 
 
 # Energy and momentum --------------------------------------------------------------------------------------------------------
@@ -371,7 +391,8 @@ def evaluate(
 
     Keys hold a number, or a dict by horizon ("1", ..., "all") or by share of the rollout ("0.25", ..., "1"); units as in the functions above,
     ``..._per_radius2`` and ``..._per_edge2`` (longest container edge) without unit. The clouds, energies and escapes are of the moving particles.
-    In a periodic box errors are those of the nearest images, and nothing escapes.
+    In a periodic box errors are those of the nearest images, and nothing escapes. ``penetrated_fraction`` is None where the scene
+    tells of no obstacles, its worst that of a hundred frames. Raises ``InputError`` for a scene with obstacles that is not one.
     """
     moving, period = trajectory.moving, trajectory.period
     true = trajectory.position[present + 1 : present + 1 + len(predicted)]
@@ -382,6 +403,11 @@ def evaluate(
     before = trajectory.position[present, moving]
     velocity, true_velocity = (velocities(cloud, before, trajectory.frame_step, period) for cloud in (p, q))
     escaped = escaped_fraction(p, periodic.walls(trajectory.bounds, period))
+    penetrated = None
+    if trajectory.scene.get("obstacles"):
+        looked_at = np.unique(np.linspace(0, len(p) - 1, _OBSTACLE_FRAMES).round().astype(int))
+        surfaces = Scene.from_dict(trajectory.scene).surfaces
+        penetrated = penetrated_fraction(p[looked_at], surfaces, float(trajectory.scene["spacing"]))
     result: dict = {
         "rollout_mse": everything,
         "rollout_mse_moving": only_moving,
@@ -391,6 +417,8 @@ def evaluate(
         "momentum_drift": momentum_drift(velocity, true_velocity),
         "escaped_fraction": float(escaped[-1]),
         "escaped_fraction_worst": float(escaped.max()),
+        "penetrated_fraction": None if penetrated is None else float(penetrated[-1]),
+        "penetrated_fraction_worst": None if penetrated is None else float(penetrated.max()),
         "first_non_finite": first_non_finite(predicted),
         "divergence_time": divergence_time(p, q, trajectory.radius, trajectory.frame_step),
     }

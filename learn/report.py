@@ -189,8 +189,11 @@ def _contenders(rows: Sequence[dict]) -> _Table:
     if two:
         table.columns += names
         table.groups.append(("MSE, moving particles", len(names)))
-    table.columns += ["all / R²", "all / edge²", "Sinkhorn", "EMD, spacings", "spacing ratio", "energy MSE", "escaped, end (worst)", "diverges, s"]
-    table.groups += [("MSE in other units", 2), ("clouds at ¼, ½, ¾, end of the run", 3), ("physics", 3)]
+    shares = {"escaped": "outside, end (worst)"}
+    if any(row.get("penetrated_fraction") is not None for row in rows):
+        shares["penetrated"] = "in obstacles, end (worst)"
+    table.columns += ["all / R²", "all / edge²", "Sinkhorn", "EMD, spacings", "spacing ratio", "energy MSE", *shares.values(), "diverges, s"]
+    table.groups += [("MSE in other units", 2), ("clouds at ¼, ½, ¾, end of the run", 3), ("physics", 2 + len(shares))]
     table.columns += ["per frame", "per simulated s", "compile", "failures"]
     table.groups += [("run time", 3), ("", 1)]
     front = pareto_front(rows)
@@ -202,13 +205,14 @@ def _contenders(rows: Sequence[dict]) -> _Table:
             cells += [_error_cell(table, row, f"rollout_mse{suffix}", at) for at in horizons]
         cells += [_error_cell(table, row, f"rollout_mse_per_{unit}2", "all") for unit in ("radius", "edge")]
         cells += [_clouds_cell(table, row, key) for key in ("sinkhorn", "emd", "spacing_ratio")]
-        energy, escaped, worst = (row.get(key) for key in ("kinetic_energy_mse", "escaped_fraction", "escaped_fraction_worst"))
-        failed = _failure(row)
+        energy, failed = row.get("kinetic_energy_mse"), _failure(row)
         cells.append(table.missing(failed) if energy is None else _Cell(number(energy)))
-        if escaped is None:
-            cells.append(table.missing(failed))
-        else:
-            cells.append(_Cell(_share(escaped) + (f" ({_share(worst)})" if worst is not None and worst > escaped else "")))
+        for key in shares:
+            share, worst = row.get(f"{key}_fraction"), row.get(f"{key}_fraction_worst")
+            if share is None:
+                cells.append(table.missing(failed))
+            else:
+                cells.append(_Cell(_share(share) + (f" ({_share(worst)})" if worst is not None and worst > share else "")))
         diverges = row.get("divergence_time")
         cells.append(_Cell("never" if diverges is None else number(diverges)) if diverges is not None or not failed else table.missing(failed))
         cells += _time_cells(table, row)

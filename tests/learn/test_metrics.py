@@ -10,6 +10,8 @@ from hypothesis.extra.numpy import arrays
 from scipy.optimize import linear_sum_assignment
 
 from learn import metrics
+from sim.obstacles import Ball, Segment
+from sim.scene import SceneFamily
 from sim.trajectory import Trajectory
 
 BOX = np.array([[0.0, 1.0], [0.0, 1.0]])
@@ -56,6 +58,15 @@ def test_escaped_fraction():
     escaped = metrics.escaped_fraction(position, BOX)
     np.testing.assert_array_equal(escaped[:2], [0.0, 0.5])
     assert math.isnan(escaped[2])
+
+
+def test_penetrated_fraction():
+    plate = Segment(kind="segment", start=[0.2, 0.5], end=[0.8, 0.5], thickness=0.2)  # its faces at heights 0.4 and 0.6
+    ball = Ball(kind="ball", center=[0.5, 0.1], radius=0.05)
+    position = np.array([[[0.5, 0.62], [0.5, 0.1]], [[0.5, 0.585], [0.5, 0.9]], [[0.5, 0.57], [0.5, 0.43]], [[np.nan, 0], [0, 0]]])
+    inside = metrics.penetrated_fraction(position, [plate, ball], spacing=0.04)  # deeper than 0.02 counts
+    np.testing.assert_array_equal(inside[:3], [0.5, 0, 1])
+    assert math.isnan(inside[3])
 
 
 def test_kinetic_energy_and_momentum():
@@ -230,6 +241,22 @@ def test_evaluate_perfect_and_shifted():
     assert result["rollout_mse_per_edge2"]["1"] == pytest.approx(result["rollout_mse"]["1"])
     assert result["emd"]["0.5"] == pytest.approx(1.0, rel=1e-5) and result["centre_of_mass_error"]["1"] == pytest.approx(1.0, rel=1e-5)
     assert result["sinkhorn"]["1"] == pytest.approx(0.05**2, rel=1e-3) and result["front_error"]["1"] == pytest.approx(1.0, rel=1e-5)
+
+
+def test_evaluate_finds_what_sank_into_a_floor():
+    scene = SceneFamily.load("configs/scenes/randomfloor.yaml").sample(seed=3)
+    start, kind = scene.start(), scene.particle_type()
+    frames = np.repeat(start[None], 150, axis=0)
+    sinking, down = np.flatnonzero(kind != 3)[:10], np.linspace(0, 1, 150)[:, None]
+    frames[:, sinking, 1] += down * (0.11 - start[sinking, 1])  # below the lowest floor, and still inside the box
+    bounds, simulator = np.array(scene.bounds), {"name": "hand"}
+    trajectory = Trajectory(frames.astype(np.float32), kind, scene.frame_step, scene.radius, bounds, scene.to_dict(), 3, simulator)
+    moving = int((kind != 3).sum())
+    result = metrics.evaluate(trajectory.position[6:], trajectory, present=5)
+    assert result["escaped_fraction_worst"] == 0
+    assert result["penetrated_fraction"] == result["penetrated_fraction_worst"] == pytest.approx(10 / moving)
+    assert metrics.evaluate(trajectory.position[6:20], trajectory, present=5)["penetrated_fraction_worst"] == 0
+    assert metrics.evaluate(falling().position[4:], falling(), present=3)["penetrated_fraction"] is None
 
 
 def test_evaluate_a_failed_rollout():

@@ -270,6 +270,16 @@ def test_moving_particles_are_shown_apart_only_where_they_differ(tmp_path):
     assert page.table("Contenders")["contender"].count("one step") == 1
 
 
+def test_particles_in_obstacles_are_shown_where_there_are_obstacles(tmp_path, rows):
+    name = "in obstacles, end (worst)"
+    _, page = write(tmp_path, rows)
+    assert name not in page.table("Contenders")["contender"]
+    sunk = [row | ({"penetrated_fraction": 0.02, "penetrated_fraction_worst": 0.3} if row["contender"] == "gns" else {}) for row in rows]
+    _, page = write(tmp_path, sunk)
+    table = page.table("Contenders")
+    assert table["gns"][table["contender"].index(name)] == "2 % (30 %)" and table["rung"][table["contender"].index(name)].startswith("–")
+
+
 def test_speed_ups_floor_and_costs(tmp_path, rows):
     _, page = write(tmp_path, rows)
     gns, dead = (page.table("What the learning bought")[name] for name in ("gns", "dead"))
