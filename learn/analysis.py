@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from learn.compare import BEST_TRIVIAL, SOLVERS
+from learn.compare import BEST_LEARNED, BEST_TRIVIAL, SOLVERS
 from learn.units import duration, number
 
 
@@ -31,7 +31,7 @@ class Yardstick:
         return value
 
     def __str__(self) -> str:
-        name = self.metric.removesuffix("_moving").replace("_", " ").replace("mse", "MSE").replace("emd", "EMD")
+        name = self.metric.removesuffix("_moving").replace("_", " ").replace("mse", "MSE").replace("emd", "EMD").replace("speed up", "speed-up")
         if self.metric.endswith("_moving"):
             name += " of moving particles"
         if self.over == "mean":
@@ -197,26 +197,44 @@ def analyse(rows: list[dict], yardstick: Yardstick = MOVING_MSE) -> list[dict]:
 
 # The verdict ----------------------------------------------------------------------------------------------------------------
 
+#: A target's metric: the ratio of ``speed_up_at_equal_error``.
+SPEED_UP = "speed_up_at_equal_error"
+
 
 @dataclass(frozen=True)
 class Target:
     """A figure that a study set out to reach: low <= metric of the contender (over that of ``relative_to``, if given) <= high."""
 
     scene: str
-    contender: str
-    yardstick: Yardstick
+    contender: str  # its name, or ``BEST_LEARNED``
+    yardstick: Yardstick  # a metric of the rows, or ``SPEED_UP``
     high: float = math.inf
     low: float = -math.inf
     relative_to: str | None = None  # a contender, or ``BEST_TRIVIAL``
 
 
-def missed_targets(rows: list[dict], targets: Sequence[Target]) -> list[str]:
-    """One phrase per target that is not reached, or for all that miss one limit of one figure; one that was never measured is a target missed."""
-    found = {(row["scene"], row["contender"]): row for row in rows}
+def _measured(rows: list[dict], target: Target, yardstick: Yardstick) -> tuple[str, float | None]:
+    """Name of the target's contender, and its figure; None where that is not known, or a speed-up of a model worse than a trivial baseline."""
+    same, name = [row for row in rows if row["scene"] == target.scene], target.contender
+    if name == BEST_LEARNED:
+        best = best_learned(analyse(same, yardstick))
+        name = best["contender"] if best else name
+    row = next((row for row in same if row["contender"] == name), None)
+    if row is None:
+        return name, None
+    if target.yardstick.metric != SPEED_UP:
+        return name, target.yardstick.of(row)
+    equal = speed_up_at_equal_error(same, row, yardstick)
+    return name, equal["ratio"] if equal["outcome"] in ("wins", "ties", "loses") else None
+
+
+def missed_targets(rows: list[dict], targets: Sequence[Target], yardstick: Yardstick = MOVING_MSE) -> list[str]:
+    """One phrase per target that is not reached, or for all that miss one limit of one figure; one that was never measured is a target missed.
+
+    yardstick: the error at which contenders are equal, see ``speed_up_at_equal_error`` and ``best_learned``."""
     missed: dict[tuple[str, str], list[tuple[str, str]]] = {}  # (figure, limit) -> (who, value)
     for target in targets:
-        row = found.get((target.scene, target.contender))
-        value = target.yardstick.of(row) if row else None
+        name, value = _measured(rows, target, yardstick)
         figure = str(target.yardstick)
         if target.relative_to is not None:
             figure += f" over that of {target.relative_to}"
@@ -228,7 +246,7 @@ def missed_targets(rows: list[dict], targets: Sequence[Target]) -> list[str]:
         limit = f"at most {target.high:.3g}" if above else f"at least {target.low:.3g}"
         if value is None or not target.low <= value <= target.high:
             shown = "unknown" if value is None else f"{value:.3g}"
-            missed.setdefault((figure, limit), []).append((f"{target.contender} on {target.scene}", shown))
+            missed.setdefault((figure, limit), []).append((f"{name} on {target.scene}", shown))
     phrases = []
     for (figure, limit), those in missed.items():
         if len(those) == 1:
@@ -364,7 +382,7 @@ def verdict(rows: list[dict], targets: Sequence[Target] = (), yardstick: Yardsti
     Of several scenes it is a count, with what stands out; ``scene_verdict`` says the rest."""
     groups = by_scene(rows)
     sentences = _headline(groups, yardstick) if len(groups) > 1 else [scene_verdict(rows, yardstick)]
-    missed = missed_targets(rows, targets)
+    missed = missed_targets(rows, targets, yardstick)
     if missed:
         sentences.append(f"Missed: {'; '.join(missed)}.")
     elif targets:

@@ -34,6 +34,8 @@ _FROM_SCENE = (*SOLVERS, "floor")
 PARTICLES, SCENE = "particles", "scene"
 #: What a target may be relative to besides a contender (``learn.analysis``): the least error of a trivial baseline.
 BEST_TRIVIAL = "best trivial"
+#: In a target, for the model that ``learn.analysis.best_learned`` names.
+BEST_LEARNED = "best learned"
 
 
 @dataclass(frozen=True)

@@ -197,6 +197,37 @@ def _curve(row: dict, name: str, part: str) -> np.ndarray:
     return np.array([math.nan if value is None else value for value in row["curves"][name][part]], float)
 
 
+#: Contenders of one kind that a figure over time shows: of more, shades and dashes are not told apart.
+_MOST_CURVES = 8
+
+
+def _distinct(rows: Sequence[dict]) -> tuple[list[dict], str]:
+    """Rows whose curves one figure can show, of each kind the ``_MOST_CURVES`` of least error over all frames, and what to say of the others."""
+    error = {row["contender"]: value if (value := MOVING_MSE.of(row)) is not None else math.inf for row in rows}
+    shown, notes = [], []
+    for kind in dict.fromkeys(row["kind"] for row in rows):
+        kin = [row["contender"] for row in rows if row["kind"] == kind]
+        shown += sorted(kin, key=error.__getitem__)[:_MOST_CURVES]
+        if len(kin) > _MOST_CURVES:
+            notes.append(f"{KIND_NAMES[kind]}: the {_MOST_CURVES} of {len(kin)} with the least error over all frames")
+    return [row for row in rows if row["contender"] in shown], "; ".join(notes)
+
+
+def _legend(figure: Figure, note: str) -> None:
+    """Of the curves in the figure: on its right, or below, in columns, where that would take the axes' room."""
+    names = figure.axes[0].get_legend_handles_labels()[1]
+    longest = max(len(name) for name in names)
+    if note:
+        figure.supxlabel(note, fontsize=8.5, color="#555555")
+    if len(names) <= 16 and longest <= 40:
+        figure.legend(loc="outside right center")
+    else:
+        columns = 3 if longest <= 44 else 2
+        width, height = figure.get_size_inches()
+        figure.set_size_inches(width, height + 0.19 * math.ceil(len(names) / columns))
+        figure.legend(loc="outside lower center", ncols=columns)
+
+
 def _time_axes(scene: str, label: str, title: str) -> tuple[Figure, Axes]:
     figure, axes = plt.subplots(figsize=(9.5, 5.2), layout="constrained")
     axes.set(xlabel="time after the known frames, s", ylabel=label, title=f"{scene}: {title}")
@@ -212,7 +243,8 @@ def error_over_time(rows: Sequence[dict], path: str | Path) -> None:
     with plt.rc_context(_STYLE):
         figure, axes = _time_axes(scene, "MSE of moving particles in the frame, length²", "error over time (median; band: least to most)")
         axes.set_yscale("log")
-        for row, (colour, dash) in zip(rows, _shades(rows), strict=True):
+        shown, note = _distinct(rows)
+        for row, (colour, dash) in zip(shown, _shades(shown), strict=True):
             time = np.array(row["curves"]["frame"]) * row["frame_step"]
             median, least, most = (_curve(row, "mse", part) for part in ("median", "min", "max"))
             if not (median > 0).any():
@@ -222,14 +254,14 @@ def error_over_time(rows: Sequence[dict], path: str | Path) -> None:
             if row["kind"] in ("learned", "floor"):
                 axes.fill_between(time, least, most, color=colour, alpha=0.15, lw=0)
             axes.plot(time, median, color=colour, ls=dash, lw=2 if row["kind"] in ("learned", "floor") else 1.3, label=row["contender"])
-        figure.legend(loc="outside right center")
+        _legend(figure, note)
         _save(figure, path)
 
 
 def kinetic_energy(rows: Sequence[dict], path: str | Path) -> None:
     """Kinetic energy per unit mass over time, median over trajectories: the truth in black under the contenders; floor and oracle left out."""
     scene = _one_scene(rows)
-    shown = [row for row in rows if row["kind"] not in ("floor", "oracle", "reference")]
+    shown, note = _distinct([row for row in rows if row["kind"] not in ("floor", "oracle", "reference")])
     with plt.rc_context(_STYLE):
         figure, axes = _time_axes(scene, "kinetic energy per unit mass, length²/s²", "kinetic energy (median)")
         time = np.array(rows[0]["curves"]["frame"]) * rows[0]["frame_step"]
@@ -240,7 +272,7 @@ def kinetic_energy(rows: Sequence[dict], path: str | Path) -> None:
             axes.plot(time, _curve(row, "kinetic_energy", "median"), color=colour, ls=dash, lw=width, label=row["contender"])
         # A contender that falls for ever is not worth the scale: the truth keeps most of the height.
         axes.set_ylim(0, 1.5 * float(np.nanmax(truth)) if np.nanmax(truth) > 0 else None)
-        figure.legend(loc="outside right center")
+        _legend(figure, note)
         _save(figure, path)
 
 

@@ -468,12 +468,17 @@ class GridEmulator(nn.Module):
             last = future[-1].cpu().numpy().astype(np.float64)
             moved = relax(last, self._bounds, self.spec.spacing, self.options.relaxation, fixed) - last
             future = future + torch.from_numpy(moved.astype(np.float32)).to(future.device) * (self.frame / len(future))[:, None]
-        for body, shape in self._bodies:
-            future[:, body] = torch.from_numpy(matched(future[:, body].cpu().numpy(), shape).astype(np.float32)).to(future.device)
+        self._keep_rigid(future)
         before = torch.cat([self._state[-1:], future[:-1]])
         self._state = torch.cat([self._state, future])[-self.options.history :]
         self._frame += stride * len(future)
         if stride > 1:
             share = torch.arange(1, stride + 1, device=future.device).view(1, -1, 1, 1) / stride
             future = (before[:, None] + share * (future - before)[:, None]).flatten(0, 1)
+            self._keep_rigid(future)  # straight lines shrink what turns
         return future.cpu().numpy()
+
+    def _keep_rigid(self, frames: Tensor) -> None:
+        """Put the particles of rigid bodies where their shape is kept, in place; frames [frames, N, d]."""
+        for body, shape in self._bodies:
+            frames[:, body] = torch.from_numpy(matched(frames[:, body].cpu().numpy(), shape).astype(np.float32)).to(frames.device)

@@ -79,17 +79,19 @@ def escaped_fraction(position: np.ndarray, bounds: np.ndarray) -> np.ndarray:
 _OBSTACLE_FRAMES = 100
 
 
-def penetrated_fraction(position: np.ndarray, obstacles: list, spacing: float) -> np.ndarray:
-    """Share of the particles more than half a spacing inside an obstacle, in every frame: [frames]; NaN in non-finite frames.
+def penetrated_fraction(position: np.ndarray, obstacles: list, bounds: np.ndarray, spacing: float) -> np.ndarray:
+    """Share of the particles in the container and more than half a spacing inside an obstacle, in every frame: [frames]; NaN in non-finite frames.
 
-    position [frames, particles, dim]; obstacles: at least one, see ``sim.scene.Scene.surfaces``. A particle that rests on a face is less deep.
+    position [frames, particles, dim]; obstacles: at least one, see ``sim.scene.Scene.surfaces``; bounds [dim, 2]. A particle that rests on a face
+    is less deep; one outside the container is an escaped one.
     """
-    position = np.asarray(position, float)
+    position, bounds = np.asarray(position, float), np.asarray(bounds, float)
     finite = np.isfinite(position).all(axis=(1, 2))
     inside = np.full(len(position), np.nan)
     if finite.any():
         distance, _, _ = combine(obstacles, position[finite].reshape(-1, position.shape[2]))
-        inside[finite] = (distance < -spacing / 2).reshape(-1, position.shape[1]).mean(axis=1)
+        contained = ((position[finite] >= bounds[:, 0]) & (position[finite] <= bounds[:, 1])).all(axis=2)
+        inside[finite] = ((distance < -spacing / 2).reshape(contained.shape) & contained).mean(axis=1)
     return inside
 
 
@@ -406,8 +408,8 @@ def evaluate(
     penetrated = None
     if trajectory.scene.get("obstacles"):
         looked_at = np.unique(np.linspace(0, len(p) - 1, _OBSTACLE_FRAMES).round().astype(int))
-        surfaces = Scene.from_dict(trajectory.scene).surfaces
-        penetrated = penetrated_fraction(p[looked_at], surfaces, float(trajectory.scene["spacing"]))
+        scene, seen = Scene.from_dict(trajectory.scene), periodic.wrapped(p[looked_at], trajectory.bounds, period)
+        penetrated = penetrated_fraction(seen, scene.surfaces, trajectory.bounds, scene.spacing)
     result: dict = {
         "rollout_mse": everything,
         "rollout_mse_moving": only_moving,

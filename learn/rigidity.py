@@ -18,14 +18,15 @@ from scipy.spatial import cKDTree
 
 from sim.trajectory import PARTICLE_TYPES
 
-#: Particles of a body are chains with links of at most so many spacings: the diagonal of a square, and a jittered lattice.
-LINK = 1.5
+#: Particles of a body are chains with links of at most so many spacings. Neighbours along an axis are up to 1.67 apart where a teacher, refined
+#: an even number of times, records one of the central particles at random.
+LINK = 1.75
 
 
 def rigid_bodies(position: np.ndarray, particle_type: np.ndarray, spacing: float) -> list[np.ndarray]:
     """Indices [k] of the particles of each rigid body, from one frame [particles, dim].
 
-    No file says which body a particle belongs to, so rigid particles within ``LINK`` spacings are of one: two that touch at the start are one.
+    A data set need not say which body a particle belongs to, so rigid particles within ``LINK`` spacings are of one: two that touch are one.
     """
     rigid = np.flatnonzero(particle_type == PARTICLE_TYPES["rigid"])
     if not len(rigid):

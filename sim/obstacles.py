@@ -76,6 +76,15 @@ class _Solid(Strict):
         """Signed distance [n] and outward normal [n, dim] of points [n, dim], as the head of this file says."""
         raise NotImplementedError
 
+    def check(self, where: str, dim: int) -> None:
+        """Raise the first fault: resolved solids may come from a data file that anyone has written."""
+        for name in type(self).model_fields:
+            value = getattr(self, name)
+            nested = isinstance(value, list) and bool(value) and isinstance(value[0], list)
+            for entry in value if nested else [value]:
+                if isinstance(entry, list) and len(entry) != (needed := 3 if name == "faces" else dim):
+                    raise mistake(f"{where}.{name}", entry, f"needs {needed} entries")
+
     def _beyond(self, corners: np.ndarray) -> np.ndarray:
         """[m]: faces or edges, by their corners [m, k, dim], that lie on or beyond one of the walls."""
         if self._walls is None:
@@ -92,7 +101,13 @@ class _Solid(Strict):
         return np.clip(points, self._walls[:, 0] + hair, self._walls[:, 1] - hair)
 
 
-class Segment(_Solid):
+class _Planar(_Solid):
+    def check(self, where: str, dim: int) -> None:
+        _in_2d(where, self.kind, dim)  # type: ignore[attr-defined]
+        super().check(where, dim)
+
+
+class Segment(_Planar):
     """All points within thickness / 2 of a straight line (2D): a ramp with round ends."""
 
     kind: Literal["segment"]
@@ -111,7 +126,7 @@ class Segment(_Solid):
         return length - self.thickness / 2, normal
 
 
-class Polygon(_Solid):
+class Polygon(_Planar):
     """A simple polygon (2D), convex or not, its corners in either order."""
 
     kind: Literal["polygon"]
@@ -137,7 +152,7 @@ class Polygon(_Solid):
         return _signed(points, foot, inside, (-np.sign(area) * _left(edges))[which])
 
 
-class Floor(_Solid):
+class Floor(_Planar):
     """All below a polyline ``vertices`` with ascending x (2D); level beyond its ends."""
 
     kind: Literal["floor"]
@@ -201,6 +216,11 @@ class Halfspace(_Solid):
     point: list[Finite]
     normal: list[Finite]
 
+    def check(self, where: str, dim: int) -> None:
+        super().check(where, dim)
+        if not np.linalg.norm(self.normal) > 0:
+            raise mistake(f"{where}.normal", self.normal, "has no direction")
+
     def distance(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         normal = np.array(self.normal) / np.linalg.norm(self.normal)
         return (points - self.point) @ normal, np.broadcast_to(normal, points.shape).copy()
@@ -212,6 +232,18 @@ class Mesh(_Solid):
     kind: Literal["mesh"]
     vertices: list[list[Finite]]
     faces: list[list[int]]
+
+    def check(self, where: str, dim: int) -> None:
+        if dim != 3:
+            raise mistake(f"{where}.kind", self.kind, "meshes are 3D; use a polygon")
+        super().check(where, dim)
+        faces = np.array(self.faces)
+        if not 0 < len(faces) <= _MOST_TRIANGLES or faces.min() < 0 or faces.max() >= len(self.vertices):
+            raise mistake(f"{where}.faces", self.faces[:1], f"must be at most {_MOST_TRIANGLES} triangles of indices of vertices")
+        try:
+            closed_surface(self.vertices, self.faces)
+        except ValueError as error:
+            raise mistake(f"{where}.faces", self.faces[:1], str(error)) from None
 
     def extent(self) -> tuple[np.ndarray, np.ndarray]:
         return np.min(self.vertices, axis=0), np.max(self.vertices, axis=0)

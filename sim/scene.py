@@ -484,6 +484,8 @@ class Scene(_Physics):
     def _not_empty(self) -> Scene:
         if not self.bodies:
             raise _mistake("bodies", [], "an empty scene: add at least one body")
+        for index, obstacle in enumerate(self.obstacles):
+            obstacle.check(f"obstacles[{index}]", self.dim)
         return self
 
     def to_dict(self) -> dict:

@@ -17,7 +17,7 @@ from pathlib import Path
 from jsonschema import Draft202012Validator
 from jsonschema.exceptions import ValidationError, relevance
 
-from learn.compare import BEST_TRIVIAL, PARTICLES, SCENE
+from learn.compare import BEST_LEARNED, BEST_TRIVIAL, PARTICLES, SCENE
 from learn.metrics import CLOUD_METRICS, CLOUD_TIMES
 from learn.variants import with_variant
 from sim.errors import InputError
@@ -328,9 +328,9 @@ def _check_comparison(study: Study, name: str, entry: dict) -> None:
             if model not in entry["learned"]:
                 raise InputError(path, f"{where}.axes.{axis}", model, f"not among the learned: {', '.join(entry['learned']) or 'none'}")
     for index, target in enumerate(entry["targets"]):
-        for key in ("contender", "relative_to"):
-            if key in target and target[key] not in [*names, BEST_TRIVIAL]:
-                raise InputError(path, f"{where}.targets[{index}].{key}", target[key], f"not among {', '.join([*names, BEST_TRIVIAL])}")
+        for key, group in (("contender", BEST_LEARNED), ("relative_to", BEST_TRIVIAL)):
+            if key in target and target[key] not in [*names, group]:
+                raise InputError(path, f"{where}.targets[{index}].{key}", target[key], f"not among {', '.join([*names, group])}")
         metric, at = target["metric"], str(target["at"]) if "at" in target else None
         if metric.startswith("rollout_mse"):
             moments = [str(horizon) for horizon in entry["horizons"]] + ["all"]

@@ -413,6 +413,22 @@ def test_targets():
     assert "Missed: none on sand" in a.verdict(rows, [a.Target("sand", "none", a.MOVING_MSE, high=1)])
 
 
+def test_a_speed_up_at_equal_error_can_be_a_target():
+    rows = elsewhere("sand", row("gns", "learned", 1e-3, 0.25), row("grid", "learned", 1e-3, 8.0))  # a rung of that error takes 1
+    ratio = {entry["contender"]: entry["equal_error"]["ratio"] for entry in a.analyse(rows)}
+    speed = a.Yardstick(a.SPEED_UP, None)
+    best = a.Target("sand", c.BEST_LEARNED, speed, low=3)
+    assert ratio["gns"] > 3 > ratio["grid"] and a.missed_targets(rows, [best]) == []
+    missed = a.missed_targets(rows, [a.Target("sand", "grid", speed, low=3), a.Target("sand", c.BEST_LEARNED, speed, low=99)])
+    assert missed == [
+        f"grid on sand: speed-up at equal error is {ratio['grid']:.3g}, not at least 3",
+        f"gns on sand: speed-up at equal error is {ratio['gns']:.3g}, not at least 99",
+    ]
+    bad = elsewhere("sand", row("gns", "learned", 0.5, 0.01))  # fast, and worse than a trivial baseline
+    assert a.missed_targets(bad, [best]) == ["gns on sand: speed-up at equal error is unknown, not at least 3"]
+    assert a.missed_targets(elsewhere("sand"), [best]) == ["best learned on sand: speed-up at equal error is unknown, not at least 3"]
+
+
 def test_break_even():
     assert a.break_even(100.0, 3.0, 1.0) == 50 and a.break_even(100.0, 1.0, 1.0) == "never" and a.break_even(100.0, 1.0, 3.0) == "never"
 

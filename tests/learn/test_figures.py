@@ -176,6 +176,21 @@ def test_curves_show_every_contender(tmp_path, kept):
     np.testing.assert_allclose(kept[1].axes[0].lines[0].get_xdata(), [0.01, 0.5, 1.0])
 
 
+@pytest.mark.parametrize("draw", [figures.error_over_time, figures.kinetic_energy])
+def test_of_many_contenders_the_most_accurate_have_curves_and_the_legend_leaves_them_room(tmp_path, kept, draw):
+    many = [row(f"a network whose name says all that it does, number {k}", "learned", 1e-5 * (40 - k), 1e-3) for k in range(20)]
+    draw([*ROWS, *many], tmp_path / "figure.svg")
+    (figure,) = kept
+    (legend,) = figure.legends
+    shown = [text.get_text() for text in legend.get_texts() if text.get_text().endswith(tuple("0123456789")) and "network" in text.get_text()]
+    assert [name.split()[-1] for name in shown] == [str(k) for k in range(14, 20)]  # with gns and shaky, of 1e-5 and 3e-5, these are the best eight
+    assert "learned: the 8 of 23 with the least error" in figure.get_supxlabel()
+    renderer, window = figure.canvas.get_renderer(), figure.bbox
+    box, axes = legend.get_window_extent(renderer), figure.axes[0].get_window_extent(renderer)
+    assert box.x0 >= window.x0 and box.x1 <= window.x1 and box.y0 >= window.y0 and not box.overlaps(axes)
+    assert axes.width > 0.8 * window.width and axes.height > 3.5 * figure.dpi
+
+
 def test_equal_rows_give_equal_files(tmp_path):
     for name in ("one.svg", "two.svg"):
         figures.error_over_time(ROWS, tmp_path / name)

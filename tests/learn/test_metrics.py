@@ -10,7 +10,7 @@ from hypothesis.extra.numpy import arrays
 from scipy.optimize import linear_sum_assignment
 
 from learn import metrics
-from sim.obstacles import Ball, Segment
+from sim.obstacles import Ball, Halfspace, Segment
 from sim.scene import SceneFamily
 from sim.trajectory import Trajectory
 
@@ -64,9 +64,13 @@ def test_penetrated_fraction():
     plate = Segment(kind="segment", start=[0.2, 0.5], end=[0.8, 0.5], thickness=0.2)  # its faces at heights 0.4 and 0.6
     ball = Ball(kind="ball", center=[0.5, 0.1], radius=0.05)
     position = np.array([[[0.5, 0.62], [0.5, 0.1]], [[0.5, 0.585], [0.5, 0.9]], [[0.5, 0.57], [0.5, 0.43]], [[np.nan, 0], [0, 0]]])
-    inside = metrics.penetrated_fraction(position, [plate, ball], spacing=0.04)  # deeper than 0.02 counts
+    inside = metrics.penetrated_fraction(position, [plate, ball], BOX, spacing=0.04)  # deeper than 0.02 counts
     np.testing.assert_array_equal(inside[:3], [0.5, 0, 1])
     assert math.isnan(inside[3])
+    floor = Halfspace(kind="halfspace", point=[0.0, 0.2], normal=[0.0, 1.0])
+    below = np.array([[[0.5, 0.1], [0.5, -0.1]]])  # the second has left the container, and is counted there
+    np.testing.assert_array_equal(metrics.penetrated_fraction(below, [floor], BOX, spacing=0.04), [0.5])
+    np.testing.assert_array_equal(metrics.escaped_fraction(below, BOX), [0.5])
 
 
 def test_kinetic_energy_and_momentum():

@@ -225,6 +225,38 @@ def test_bodies_start_clear_of_obstacles(kind, seed):
 @pytest.mark.parametrize(
     ("obstacle", "message"),
     [
+        ({"kind": "ball", "center": [0.5, 0.5, 0.5], "radius": 0.1}, r"obstacles\[0\].center = .*: needs 2 entries"),
+        ({"kind": "segment", "start": [], "end": [0.5, 0.5], "thickness": 0.1}, r"obstacles\[0\].start = \[\]: needs 2 entries"),
+        ({"kind": "floor", "vertices": [[0, 0.1], [1, 0.1, 3]]}, r"obstacles\[0\].vertices = .*: needs 2 entries"),
+        ({"kind": "halfspace", "point": [0.5, 0.1], "normal": [0, 0]}, r"obstacles\[0\].normal = .*: has no direction"),
+        ({"kind": "mesh", "vertices": [[0, 0, 0]], "faces": [[0, 0, 0]]}, r"obstacles\[0\].kind = 'mesh': meshes are 3D"),
+    ],
+)
+def test_resolved_obstacles_of_another_dimension_are_refused(obstacle, message):
+    content = family().sample(0).to_dict()
+    with pytest.raises(InputError, match=message):
+        Scene.from_dict(content | {"obstacles": [obstacle]})
+
+
+@pytest.mark.parametrize(
+    ("vertices", "faces", "message"),
+    [
+        ([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]], [[0, 1, 2], [0, 1, 4]], "indices of vertices"),
+        ([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]], [[0, 1, 2], [0, 1, -1]], "indices of vertices"),
+        ([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]], [[0, 1, 2], [0, 1]], "needs 3 entries"),
+        ([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]], [[0, 1, 2], [0, 1, 3]], "not a closed surface"),
+        ([], [], "indices of vertices|needs 3 entries"),
+    ],
+)
+def test_resolved_meshes_that_are_none_are_refused(shapes, vertices, faces, message):
+    content = SceneFamily(mesh_family("cube.obj"), shapes["cube"].with_name("scene.yaml")).sample(0).to_dict()
+    with pytest.raises(InputError, match=rf"obstacles\[0\]\..*({message})"):
+        Scene.from_dict(content | {"obstacles": [{"kind": "mesh", "vertices": vertices, "faces": faces}]})
+
+
+@pytest.mark.parametrize(
+    ("obstacle", "message"),
+    [
         (FAMILIES["segment"] | {"thickness": 0.07}, r"obstacles\[0\].thickness = 0.07: thinner than 1.5 grid cells"),
         (FAMILIES["segment"] | {"colour": 1}, r"obstacles\[0\].colour = 1: unknown key"),
         (FAMILIES["segment"] | {"length": [0.5, 0.2]}, r"obstacles\[0\].length = .*low must not exceed high"),

@@ -105,6 +105,8 @@ MISTAKES = [
     (drop(*COMPARISON, "targets", 0, "at"), "targets[0].at = None: rollout_mse_moving is known at"),
     (put(*COMPARISON, "targets", 0, "metric", value="emd"), "targets[0].at = 'all': emd is known at 0.25, 0.5, 0.75, 1"),
     (put(*COMPARISON, "targets", 0, "metric", value="escaped_fraction"), "targets[0].at = 'all': escaped_fraction is one figure; leave it out"),
+    (put(*COMPARISON, "targets", 0, "metric", value="speed_up_at_equal_error"), "targets[0].at = 'all': speed_up_at_equal_error is one figure"),
+    (put(*COMPARISON, "targets", 0, "contender", value="best"), "targets[0].contender = 'best': not among"),
     (put(*COMPARISON, "axes", value={"size": {"gns": 1, "gsn": 2}}), "comparisons.puddle.axes.size = 'gsn': not among the learned: gns"),
     (put(*COMPARISON, "axes", value={"size": {"gns": 1}}), "comparisons.puddle.axes.size = ['gns']"),
     (put(*COMPARISON, "generalisation", value={"with": []}), "comparisons.puddle.generalisation.over = None: missing"),
