@@ -18,7 +18,7 @@ from sim.trajectory import Trajectory, atomic_path
 
 HEAD = """# Gallery
 
-One test trajectory of each domain of Sanchez-Gonzalez et al. (2020) that our solvers make so far, and of our FLUIDSHAKE with a floating box,
+One test trajectory of each domain of Sanchez-Gonzalez et al. (2020), and of our FLUIDSHAKE with a floating box,
 six moments from start to end. Made by `make gallery`; the scenes are in `configs/scenes/`, and [domains.md](domains.md) sets their numbers
 beside the published ones. Colour is speed, or the kind of matter where several meet.
 """

@@ -17,17 +17,19 @@ from sim.trajectory import ShardReader
 ROOT = Path(__file__).resolve().parent.parent
 PAGE = ROOT / "docs/extending.md"
 #: What is copied: the code, and what the commands of the page read.
-PARTS = ("sim", "learn", "workflow", "pyproject.toml", "tests/conftest.py", "tests/sim/experiments.py")
+PARTS = ("sim", "learn", "workflow", "Snakefile", "pyproject.toml", "tests/conftest.py", "tests/sim/experiments.py")
 
-#: Commands of one section in one process: sluice-sim, sluice-learn and python, as a shell would start them, less their start-up.
+#: Commands of one section in one process, as a shell would start them: sluice-sim, sluice-learn and python less their start-up, and snakemake.
 RUNNER = """
-import json, runpy, sys
+import json, runpy, subprocess, sys
 import learn.cli, sim.cli
 mains = {"sluice-sim": sim.cli.main, "sluice-learn": learn.cli.main}
 for program, *arguments in json.loads(sys.argv[1]):
     print("$", program, *arguments, flush=True)
     if program in mains:
         code = mains[program](arguments)
+    elif program == "snakemake":
+        code = subprocess.run([sys.executable, "-m", program, "--cores", "2", *arguments], stderr=subprocess.STDOUT).returncode
     elif arguments[0] == "-m":
         import pytest
         code = pytest.main(arguments[2:])
@@ -117,8 +119,8 @@ def trajectory(path):
         return reader.read(reader.indices()[0])
 
 
-def test_the_page_has_its_four_examples():
-    assert list(sections()) == ["A scene", "A material", "A model", "A metric"]
+def test_the_page_has_its_five_examples():
+    assert list(sections()) == ["A scene", "A material", "A model", "A metric", "A study"]
     assert all(section.commands for section in sections().values())
 
 
@@ -174,3 +176,16 @@ def test_a_metric(ran):
         assert rows[name]["hausdorff"]["1"] > 0 and rows[name]["spread"]["max"]["hausdorff"]["1"] >= rows[name]["hausdorff"]["1"]
     schema = json.loads((folder / "workflow/schemas/study.schema.json").read_text())
     assert "hausdorff" in schema["$defs"]["target"]["properties"]["metric"]["enum"]
+
+
+def test_a_study(tree):
+    """The dry run plans every job, and the page's tables name every key that a study may have."""
+    command = ["-m", "snakemake", "-n", "--cores", "2", "--config", "study=configs/studies/bump.yaml"]
+    answer = subprocess.run([sys.executable, *command], cwd=tree, capture_output=True, text=True, env=os.environ | {"PYTHONPATH": str(tree)})
+    assert answer.returncode == 0, answer.stdout + answer.stderr
+    assert re.search(r"^train +3$", answer.stdout, re.MULTILINE) and re.search(r"^film +1$", answer.stdout, re.MULTILINE)
+    assert sections()["A study"].commands == [command[1:3] + command[5:]]
+    schema = json.loads((ROOT / "workflow/schemas/study.schema.json").read_text())
+    named = set(re.findall(r"`(\w+)`", PAGE.read_text().split("## A study")[1]))
+    parts = [schema["$defs"][part]["properties"] for part in ("data", "model", "comparison", "rung", "target")]
+    assert {key for part in parts for key in part} - named == set()

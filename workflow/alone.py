@@ -23,7 +23,7 @@ def hold(folder: Path) -> None:
         os.write(lock, str(os.getpid()).encode())
     except BlockingIOError:
         process = os.read(lock, 20).decode()
-        known = f" (process {process}); wait for its end, or stop it: kill -INT {process}"
+        known = f" (process {process}); wait for its end, or end it after its running jobs: kill {process}"
         remedy = "another run is at work on it" + (known if process else "; wait for its end")  # it may have just begun
         raise InputError(folder, "study", folder.name, remedy) from None
     except OSError as error:

@@ -1,4 +1,4 @@
-"""What the cells of the stress matrix say together: a summary (rows and a verdict in words) and one self-contained page with pictures."""
+"""What the cells of the stress matrix say together: a summary (rows and a verdict in words), one self-contained page with pictures, one of text."""
 
 from __future__ import annotations
 
@@ -184,3 +184,34 @@ def write_report(summary: Mapping, path: str | Path) -> None:
     )
     with atomic_path(path) as temporary:
         temporary.write_bytes(page)
+
+
+_INTRODUCTION = """# Stability
+
+What the solvers do when they are asked for too much: a matrix of stresses, a cell at a time. A case is a file of `sim/stability/` and says of each of
+its cells what reaction is right: the energy stays bounded (at most {bound:g} times what there was to release), or the run is refused before it
+begins, or it ends as failed with its reason. Nothing may go wrong unnoticed. Steps adapt by default; a fixed one (`time_step` of a scene) above the
+limit is refused with the limit and what sets it, and is never shortened silently.
+
+This page is `results/stability/stability.md` of `make study STUDY=stability`; `report.html` beside it has every cell, the maps and the energies over
+time.
+
+"""
+
+
+def write_page(summary: Mapping, path: str | Path) -> None:
+    """Write docs/stability.md: the verdict, a table of the cases, and the cells that are wrong. summary: as of ``write_report``."""
+    lines = ["| case | cells | right | seconds |", "|---|---|---|---|"]
+    wrong = [one for one in summary["rows"] if not one["right"]]
+    for case, members in groupby(summary["rows"], key=lambda one: one["case"]):
+        rows = list(members)
+        right, seconds = sum(one["right"] for one in rows), sum(one["seconds"] for one in rows)
+        lines.append(f"| `{case}`: {title(case)} | {len(rows)} | {right} | {seconds:.1f} |")
+    if wrong:
+        lines += ["", "## Wrong", "| case | cell | right would be | observed |", "|---|---|---|---|"]
+        lines += [f"| `{one['case']}` | {one['cell']} | {one['expected']} | {one['observed']} |" for one in wrong]
+    hardware, versions = summary["hardware"], summary["versions"]
+    told = ", ".join(f"{name} {version}" for name, version in versions.items() if version)
+    text = _INTRODUCTION.format(bound=BOUND) + summary["verdict"] + "\n\n" + "\n".join(lines) + f"\n\nOn {hardware['cpu']}, {told}.\n"
+    with atomic_path(path) as temporary:
+        temporary.write_text(text)

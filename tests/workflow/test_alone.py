@@ -31,7 +31,7 @@ def test_a_study_is_held_by_one_process_until_it_ends(tmp_path):
     try:
         assert first.stdout.readline() == other.stdout.readline() == "held\n", "another study has a folder of its own"
         refused = begin(tmp_path / "results/a")
-        said = f"another run is at work on it (process {first.pid}); wait for its end, or stop it: kill -INT {first.pid}"
+        said = f"another run is at work on it (process {first.pid}); wait for its end, or end it after its running jobs: kill {first.pid}"
         assert refused.communicate(timeout=60)[1].splitlines()[-1].endswith(f"a: study = 'a': {said}")
         assert sorted(os.listdir(tmp_path / "results")) == [".a.lock", ".b.lock"]
         first.kill()

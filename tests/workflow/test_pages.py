@@ -5,7 +5,7 @@ import pytest
 from browser import PHONE, check, look, needs_browser
 
 from sim.stability import Cell, Series
-from sim.stability.report import row, verdict, write_report
+from sim.stability.report import row, verdict, write_page, write_report
 
 pytestmark = needs_browser
 
@@ -43,3 +43,8 @@ def test_the_page_of_a_stability_study(tmp_path):
     summary = {"title": "Stress", "verdict": verdict(rows), "rows": rows, "hardware": {"cpu": "x" * 80}, "versions": {}}
     write_report(summary | {"provenance": {"command": "make"}}, tmp_path / "report.html")
     assert len(check(tmp_path / "report.html", tmp_path / "browser").media) == 1
+    write_page(summary, tmp_path / "stability.md")
+    text = (tmp_path / "stability.md").read_text()
+    assert "1 of 2 cells of 2 cases react as they should." in text
+    assert "| `rest`: No gravity, no motion: a block of each material stays where it is for ten thousand steps | 1 | 1 | 0.1 |" in text
+    assert "| `impact` | sand on a plate | " in text.split("## Wrong")[1]

@@ -27,6 +27,7 @@ rule report:
     output:
         summary=f"{RESULTS}/summary.json",
         report=report(f"{RESULTS}/report.html", caption="../report/stability.rst", category="Report"),
+        page=f"{RESULTS}/stability.md",
     params:
         recipe=STUDY.stability_recipe(),
     log:
