@@ -218,7 +218,7 @@ def _legend(figure: Figure, note: str) -> None:
     names = figure.axes[0].get_legend_handles_labels()[1]
     longest = max(len(name) for name in names)
     if note:
-        figure.supxlabel(note, fontsize=8.5, color="#555555")
+        figure.axes[0].set_xlabel(f"{figure.axes[0].get_xlabel()}\n({note})")
     if len(names) <= 16 and longest <= 40:
         figure.legend(loc="outside right center")
     else:

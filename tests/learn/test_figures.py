@@ -5,6 +5,7 @@ import math
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from matplotlib.transforms import Bbox
 
 from learn import figures
 from sim.errors import InputError
@@ -184,10 +185,12 @@ def test_of_many_contenders_the_most_accurate_have_curves_and_the_legend_leaves_
     (legend,) = figure.legends
     shown = [text.get_text() for text in legend.get_texts() if text.get_text().endswith(tuple("0123456789")) and "network" in text.get_text()]
     assert [name.split()[-1] for name in shown] == [str(k) for k in range(14, 20)]  # with gns and shaky, of 1e-5 and 3e-5, these are the best eight
-    assert "learned: the 8 of 23 with the least error" in figure.get_supxlabel()
+    assert "learned: the 8 of 23 with the least error" in figure.axes[0].get_xlabel()
     renderer, window = figure.canvas.get_renderer(), figure.bbox
-    box, axes = legend.get_window_extent(renderer), figure.axes[0].get_window_extent(renderer)
-    assert box.x0 >= window.x0 and box.x1 <= window.x1 and box.y0 >= window.y0 and not box.overlaps(axes)
+    box = Bbox.union([text.get_window_extent(renderer) for text in legend.get_texts()])
+    axes = figure.axes[0].get_window_extent(renderer)
+    assert box.x0 >= window.x0 and box.x1 <= window.x1 and box.y0 >= window.y0
+    assert not box.overlaps(figure.axes[0].get_tightbbox(renderer))
     assert axes.width > 0.8 * window.width and axes.height > 3.5 * figure.dpi
 
 
