@@ -55,8 +55,7 @@ def main() -> None:
         start = start_from(truths[stiff], 6)
         rungs = [
             (f"solver, {modulus:.0e} Pa", "solver", {"particles": "recorded", "stiffness": modulus / stiff, "frames": 16})
-            for modulus in (stiff, *SOFTER)
-            if modulus <= stiff
+            for modulus in (stiff, *(softer for softer in SOFTER if softer < stiff))
         ]
         contenders = list(solver_ladder(rungs, "mpm"))
         if options.model:

@@ -14,6 +14,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist
 
 from sim import periodic
+from sim.errors import InputError
 from sim.obstacles import combine
 from sim.scene import Scene
 from sim.trajectory import Trajectory
@@ -394,7 +395,8 @@ def evaluate(
     Keys hold a number, or a dict by horizon ("1", ..., "all") or by share of the rollout ("0.25", ..., "1"); units as in the functions above,
     ``..._per_radius2`` and ``..._per_edge2`` (longest container edge) without unit. The clouds, energies and escapes are of the moving particles.
     In a periodic box errors are those of the nearest images, and nothing escapes. ``penetrated_fraction`` is None where the scene
-    tells of no obstacles, its worst that of a hundred frames. Raises ``InputError`` for a scene with obstacles that is not one.
+    tells of no obstacles, its worst that of a hundred frames. Raises ``InputError`` for a scene with obstacles that is not one, or of another
+    dimension than the positions.
     """
     moving, period = trajectory.moving, trajectory.period
     true = trajectory.position[present + 1 : present + 1 + len(predicted)]
@@ -409,6 +411,8 @@ def evaluate(
     if trajectory.scene.get("obstacles"):
         looked_at = np.unique(np.linspace(0, len(p) - 1, _OBSTACLE_FRAMES).round().astype(int))
         scene, seen = Scene.from_dict(trajectory.scene), periodic.wrapped(p[looked_at], trajectory.bounds, period)
+        if scene.dim != p.shape[2]:
+            raise InputError("scene", "dim", scene.dim, f"positions have {p.shape[2]} coordinates; generate the shard again")
         penetrated = penetrated_fraction(seen, scene.surfaces, trajectory.bounds, scene.spacing)
     result: dict = {
         "rollout_mse": everything,

@@ -1,6 +1,7 @@
 """Metrics against values computed by hand, and the properties that a distance between clouds must have."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from hypothesis.extra.numpy import arrays
 from scipy.optimize import linear_sum_assignment
 
 from learn import metrics
+from sim.errors import InputError
 from sim.obstacles import Ball, Halfspace, Segment
 from sim.scene import SceneFamily
 from sim.trajectory import Trajectory
@@ -261,6 +263,10 @@ def test_evaluate_finds_what_sank_into_a_floor():
     assert result["penetrated_fraction"] == result["penetrated_fraction_worst"] == pytest.approx(10 / moving)
     assert metrics.evaluate(trajectory.position[6:20], trajectory, present=5)["penetrated_fraction_worst"] == 0
     assert metrics.evaluate(falling().position[4:], falling(), present=3)["penetrated_fraction"] is None
+    solid = replace(trajectory, position=np.concatenate([trajectory.position, trajectory.position[:, :, :1]], 2), bounds=np.array([[0.1, 0.9]] * 3))
+    solid.scene["gravity"] = [0, -9.8]
+    with pytest.raises(InputError, match="scene: dim = 2: positions have 3 coordinates"):
+        metrics.evaluate(solid.position[6:20], solid, present=5)
 
 
 def test_evaluate_a_failed_rollout():
