@@ -57,7 +57,7 @@ def velocity_noise(
     frames, particles, dim = position.shape
     first, whole = place or (0, particles)
     draws = frames - 1 if scheme in ("random_walk", "uncorrelated") else 1
-    velocity = torch.randn((draws, whole, dim), generator=generator, dtype=torch.float32)[:, first : first + particles]
+    velocity = torch.randn((draws, whole, dim), generator=generator, dtype=torch.float32)[:, first : first + particles].to(position.device)
     velocity = velocity * (sigma / math.sqrt(frames - 1) if scheme == "random_walk" else sigma)
     velocity = velocity.to(position)
     if scheme == "random_walk":

@@ -278,6 +278,7 @@ class GridEmulator(nn.Module):
         # One particle per cell of its own: density 1 in the bulk.
         constant("particle_mass", float(spec.spacing**dim / (extent / cells).prod()))
         self.register_buffer("corners", torch.tensor(list(itertools.product((0, 1), repeat=dim))), persistent=False)
+        self.register_buffer("corner_ids", self.corners @ self.grid.stride0, persistent=False)
         self.register_buffer("nodes", torch.tensor(nodes), persistent=False)
         self.register_buffer("types", torch.tensor(spec.particle_types), persistent=False)
         # A data set may hold kinematic particles alone.
@@ -303,7 +304,8 @@ class GridEmulator(nn.Module):
         base = torch.minimum(place.detach().floor().long().clamp(min=0), self.nodes - 2)
         fraction = place - base
         inside = ((fraction >= 0) & (fraction <= 1)).all(1)
-        node = (base[:, None] + self.corners + 1) @ self.grid.stride0 + (example * self.grid.sizes[0])[:, None]
+        # CUDA has no products of integer matrices.
+        node = (((base + 1) * self.grid.stride0).sum(1) + example * self.grid.sizes[0])[:, None] + self.corner_ids
         weight = torch.where(self.corners.bool(), fraction[:, None], 1 - fraction[:, None]).prod(2)
         return node, torch.where(inside[:, None], weight, 0)
 

@@ -12,6 +12,7 @@ import sys
 import time
 from pathlib import Path
 
+import h5py
 import pytest
 import torch
 from browser import check, needs_browser
@@ -208,6 +209,41 @@ def test_a_study_chooses_device_and_processes(copied):
     made = subprocess.run(several.replace("--threads 2 --device cuda", "--device cpu"), shell=True, cwd=copied, executable="/bin/bash")
     done = json.loads((copied / "results" / "micro" / "models" / "gns" / "seed-0.json").read_text())
     assert made.returncode == 0 and (done["processes"], done["device"], done["steps"]) == (2, "cpu", 300)
+
+
+ON_A_DEVICE = """
+import sys
+
+import torch
+from other_device import OtherDevice
+
+from workflow.scripts import errors, rollouts
+
+torch.cuda.is_available, torch.cuda.get_device_name = lambda: True, lambda: "none at all"
+study = "configs/studies/micro.yaml"
+with OtherDevice():
+    errors.main(study, "puddle", "errors.json", "cuda")
+    rollouts.main(study, "puddle", "cuda", "errors.json", "truth.h5", "grid.h5")
+"""
+
+
+def test_a_comparison_on_a_device_is_that_of_the_cpu(copied):
+    """On the made-up device of ``tests/learn/other_device.py``, as no GPU is needed to test here."""
+    paths = os.pathsep.join([str(Path(__file__).parents[1] / "learn"), str(copied)])
+    done = subprocess.run([sys.executable, "-c", ON_A_DEVICE], cwd=copied, env=os.environ | {"PYTHONPATH": paths}, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    found = json.loads((copied / "errors.json").read_text())
+    wanted = json.loads((copied / "results" / "micro" / "comparisons" / "puddle" / "errors.json").read_text())
+    for row, other in zip(found, wanted, strict=True):
+        assert (row["contender"], row["runs"], row["failures"]) == (other["contender"], other["runs"], other["failures"])
+        if row["kind"] == "learned":
+            assert row["settings"]["rolled out on"] == "none at all" and row["seconds_per_frame"] is None and other["seconds_per_frame"] > 0
+            for name in ("one_step_mse", "rollout_mse_moving", "spacing_ratio"):
+                assert row[name] == pytest.approx(other[name], rel=1e-3)
+    assert [row["contender"] for row in found if row["kind"] == "learned"] == ["gns", "grid"]
+    with h5py.File(copied / "grid.h5") as film:
+        (group,) = film.values()
+        assert json.loads(group.attrs["meta"])["simulator"]["settings"]["rolled out on"] == "none at all"
 
 
 # Resuming -------------------------------------------------------------------------------------------------------------------
