@@ -90,8 +90,13 @@ _ANGLES = (0, 180, 35, -35, 145, -145, 90, -90, 65, -65, 115, -115)
 _PLACES = [(radius, math.radians(angle)) for radius in (9, 14, 20, 28, 38, 50, 64, 80) for angle in _ANGLES]
 
 
-def _place_labels(axes: Axes, points: Sequence[tuple[float, float]], labels: Sequence[str], colours: Sequence, lines: Sequence[np.ndarray]) -> None:
-    """Write each label at the nearest free place around its point: off the other labels, all points and lines ([n, 2]), inside the axes."""
+def _place_labels(
+    axes: Axes, points: Sequence[tuple[float, float]], labels: Sequence[str | None], colours: Sequence, lines: Sequence[np.ndarray]
+) -> None:
+    """Write each label at the nearest free place around its point: off the other labels, all points and lines ([n, 2]), inside the axes.
+
+    None is no label, but its point is kept free.
+    """
     figure = axes.figure
     figure.canvas.draw()
     renderer, frame, size = figure.canvas.get_renderer(), axes.get_window_extent(), figure.dpi / 72
@@ -108,7 +113,10 @@ def _place_labels(axes: Axes, points: Sequence[tuple[float, float]], labels: Seq
     distances = np.linalg.norm(pixels[:, None] - pixels, axis=2)
     crowd = np.exp(-distances / (40 * size)).sum(axis=1)
     for index in np.argsort(-crowd, kind="stable"):  # the crowded points choose first
-        text = axes.annotate(labels[index], points[index], textcoords="offset points", xytext=(0, 0), fontsize=8.5, color=colours[index])
+        label = labels[index]
+        if label is None:
+            continue
+        text = axes.annotate(label, points[index], textcoords="offset points", xytext=(0, 0), fontsize=8.5, color=colours[index])
         extent = text.get_window_extent(renderer)
         anchor = np.where(directions[:, 0] > 0.2, 0.0, np.where(directions[:, 0] < -0.2, 1.0, 0.5))
         low = pixels[index] + radii[:, None] * size * directions - np.stack([anchor * extent.width, np.full(len(radii), extent.height / 2)], 1)
@@ -125,8 +133,14 @@ def _place_labels(axes: Axes, points: Sequence[tuple[float, float]], labels: Seq
             axes.annotate("", points[index], textcoords="offset points", xytext=tuple((edge - pixels[index]) / size), arrowprops=leader)
 
 
+#: Rungs that are all named in a figure: the names of more would cover the points, so of more those on the front are.
+MOST_NAMED = 16
+
+
 def error_over_run_time(rows: Sequence[dict], path: str | Path, yardstick: Yardstick = MOVING_MSE) -> None:
     """Error over seconds per frame, log-log, one point a contender, whiskers from least to most over trajectories and timings.
+
+    Of more than ``MOST_NAMED`` rungs of a solver those on the front are named.
 
     The front of solver and learned contenders is a line, the chaos floor a band in which errors mean nothing. An error of zero (the
     reference) has no place on a log axis: it sits at the lower edge. Contenders without error or time are listed under the axes.
@@ -155,7 +169,8 @@ def error_over_run_time(rows: Sequence[dict], path: str | Path, yardstick: Yards
                 axes.plot(*lines[-1].T, color=colour, lw=1, alpha=0.45, zorder=2)
             hollow = {"markerfacecolor": "white"} if row["failures"] else {}
             axes.plot(x, y, MARKERS[row["kind"]], color=colour, markersize=13 if row["kind"] == "reference" else 8, zorder=4, clip_on=False, **hollow)
-        front = [(row["seconds_per_frame"], max(yardstick.known(row), ground)) for row in pareto_front(list(rows), yardstick)]
+        on_front = pareto_front(list(rows), yardstick)
+        front = [(row["seconds_per_frame"], max(yardstick.known(row), ground)) for row in on_front]
         if len(front) > 1:
             lines.append(np.array(front))
             axes.plot(*lines[-1].T, color="#444444", lw=1.2, ls=(0, (4, 2)), zorder=1)
@@ -185,9 +200,13 @@ def error_over_run_time(rows: Sequence[dict], path: str | Path, yardstick: Yards
             notes.append(f"Chaos floor below the axis: {floors[0]:.1e}.")
         if left_out:
             notes.append("Not drawn: " + "; ".join(left_out) + ".")
+        rungs = sum(row["kind"] == "solver" for row in drawn)
+        named = {row["contender"] for row in (drawn if rungs <= MOST_NAMED else on_front)}
+        if rungs > MOST_NAMED:
+            notes.append(f"Of {rungs} settings of the solver those on the front are named; the tables have all.")
         if notes:
             figure.supxlabel("\n".join(notes), fontsize=8.5, color="#555555", wrap=True)
-        labels = [row["contender"] for row in drawn]
+        labels = [row["contender"] if row["kind"] != "solver" or row["contender"] in named else None for row in drawn]
         _place_labels(axes, points, labels, [COLOURS[row["kind"]] for row in drawn], lines)
         _save(figure, path)
 

@@ -237,3 +237,16 @@ def test_a_broken_log_is_named(tmp_path, content):
     with pytest.raises(InputError, match="log.csv: columns"):
         figures.training_curve({"gns": folder}, tmp_path / "training.png")
     assert not (tmp_path / "training.png").exists()
+
+
+def test_of_many_rungs_those_on_the_front_are_named(tmp_path, kept):
+    def named(rungs):
+        worse = [row(f"worse {k}", "solver", 1e-3 * k, 2e-3 / k) for k in range(1, rungs - 1)]
+        best = [row("slow", "solver", 1e-6, 2e-3), row("fast", "solver", 1e-5, 1e-4)]
+        figures.error_over_run_time([*best, *worse, row("gns", "learned", 1e-2, 1e-3)], tmp_path / "many.svg")
+        return {text.get_text() for text in kept[-1].axes[0].texts} - {""}, kept[-1].get_supxlabel()
+
+    names, note = named(figures.MOST_NAMED)
+    assert len(names) == figures.MOST_NAMED + 1 and note == ""
+    names, note = named(figures.MOST_NAMED + 1)
+    assert names == {"slow", "fast", "gns"} and note.startswith(f"Of {figures.MOST_NAMED + 1} settings of the solver those on the front are named")
