@@ -12,7 +12,7 @@ SNAKEMAKE = $(PY) -m snakemake --workflow-profile profiles/$(PROFILE) --config s
 .PHONY: demo smoke study resume test validate gallery bench setup system
 .DEFAULT_GOAL := demo
 
-demo: ## the demonstration: results/demo/report.html, in about twenty minutes on two cores
+demo: ## the demonstration: results/demo/report.html, in about eighteen minutes on two cores
 	@$(MAKE) --no-print-directory study STUDY=demo
 
 smoke: ## every part once, in about a minute: results/smoke/report.html
