@@ -15,7 +15,7 @@ from other_device import OtherDevice
 
 from learn.checkpoint import load_model
 from learn.dataset import Dataset, DataSettings
-from learn.train import Config, TrainSettings, train
+from learn.train import Config, Trainer, TrainSettings, train
 from sim.simulator import rollout, start_from
 
 RELAXATION = {"loops": 1, "strength": 0.05, "density": 1.0}
@@ -76,7 +76,7 @@ def test_the_device_that_is_none(device):
 @pytest.mark.parametrize("name", MODELS)
 @pytest.mark.parametrize("optimizer", ["adam", "muon"])
 @pytest.mark.parametrize("dataset", ["bounce", "mixed"])
-def test_training_and_rollouts_as_on_the_cpu(name, optimizer, dataset, device, tmp_path, request):
+def test_training_and_rollouts_as_on_the_cpu(name, optimizer, dataset, device, tmp_path, request, monkeypatch):
     data = request.getfixturevalue(f"{dataset}_dataset")
 
     def configured(where: str) -> Config:
@@ -84,10 +84,20 @@ def test_training_and_rollouts_as_on_the_cpu(name, optimizer, dataset, device, t
         chosen = TrainSettings(steps=6, optimizer=optimizer, learning_rate=1e-3, warmup_steps=1, device=where, **settings)
         return Config(model=name, settings=MODELS[name], training=chosen, data=DataSettings(mirror=dataset == "bounce"))
 
+    steps = Trainer._train_step
+
+    def dies(trainer, progress):
+        if trainer.step == 4:
+            raise LookupError
+        steps(trainer, progress)
+
     train(configured("cpu"), data, tmp_path / "cpu", "here")
     with device:
-        train(configured("cuda"), data, tmp_path / "cuda", "here")
-        (tmp_path / "cuda" / "done.json").unlink()  # from its last checkpoint again
+        with monkeypatch.context() as patch, pytest.raises(LookupError):
+            patch.setattr(Trainer, "_train_step", dies)
+            train(configured("cuda"), data, tmp_path / "cuda", "here")
+        assert not (tmp_path / "cuda" / "done.json").exists()
+        # On from the checkpoint of the third step.
         train(configured("cuda"), data, tmp_path / "cuda", "here")
         model = load_model(tmp_path / "cuda" / "best.pt").to("cuda")
         start = start_from(Dataset(data, "valid").trajectory(0), model.history)

@@ -212,8 +212,6 @@ def test_a_study_chooses_device_and_processes(copied):
 
 
 ON_A_DEVICE = """
-import sys
-
 import torch
 from other_device import OtherDevice
 
