@@ -8,8 +8,16 @@ sys.path.insert(0, workflow.basedir)
 
 from sim.errors import InputError
 from workflow.alone import hold
+from workflow.gpu import check_gpu
 from workflow.sources import code_hash
 from workflow.study import PARTS, load_study
+
+
+def refuse(error):
+    """Snakemake turns every exception into a traceback of its own; a mistake in a study is one line and exit code 2."""
+    print(f"sluice: {error}", file=sys.stderr, flush=True)
+    os._exit(2)
+
 
 try:
     STUDY = load_study(config.get("study", "configs/studies/smoke.yaml"))
@@ -18,9 +26,7 @@ try:
     if workflow.is_main_process and not dry:
         hold(STUDY.folder)
 except InputError as error:
-    # Snakemake turns every exception into a traceback of its own; a mistake in a study is one line and exit code 2.
-    print(f"sluice: {error}", file=sys.stderr, flush=True)
-    os._exit(2)
+    refuse(error)
 
 RESULTS = str(STUDY.folder)
 PYTHON = sys.executable
@@ -37,6 +43,17 @@ else:
     include: "workflow/rules/compare.smk"
     include: "workflow/rules/pictures.smk"
     include: "workflow/rules/report.smk"
+
+
+onstart:
+    # Of the jobs that are to run here: data can be made on one machine for a training on another.
+    try:
+        if workflow.is_main_process and workflow.local_exec:
+            for job in workflow.dag.needrun_jobs():
+                if job.rule.name in ("train", "errors", "rollouts") and job.resources.gpu:
+                    check_gpu(STUDY, *(("models", job.wildcards.model) if job.rule.name == "train" else ("comparisons", job.wildcards.comparison)))
+    except InputError as error:
+        refuse(error)
 
 
 wildcard_constraints:

@@ -11,7 +11,6 @@ from learn.checkpoint import load_model
 from learn.compare import CompareSettings
 from learn.dataset import Dataset
 from learn.rollout import check_fit
-from sim.errors import InputError
 from sim.ladder import solver_ladder
 from sim.simulator import Kind, Simulator
 from sim.trajectory import Trajectory
@@ -27,13 +26,6 @@ def test_trajectories(study: Study, comparison: str, numbers: Iterable[int] | No
     entry = study.comparisons[comparison]
     data = Dataset(study.data_folder(entry["data"], "test"), "test")
     return [data.trajectory(number) for number in (range(min(entry["trajectories"], len(data))) if numbers is None else numbers)]
-
-
-def check_device(study: Study, comparison: str, device: str) -> None:
-    """``InputError`` where a comparison asks for a GPU that is not there."""
-    if device == "cuda" and not torch.cuda.is_available():
-        remedy = "this machine has no CUDA device that torch can use; leave it out"
-        raise InputError(study.path, f"comparisons.{comparison}.resources.gpus", 1, remedy)
 
 
 def learned(study: Study, comparison: str, model: str, device: str = "cpu") -> list[Simulator]:

@@ -211,6 +211,29 @@ def test_a_study_chooses_device_and_processes(copied):
     assert made.returncode == 0 and (done["processes"], done["device"], done["steps"]) == (2, "cpu", 300)
 
 
+@pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")
+def test_a_missing_gpu_is_missed_before_the_data_are_made(copied):
+    study, model = copied / "configs" / "studies" / "micro.yaml", copied / "configs" / "models" / "micro_gns.yaml"
+    data, remedy = "results/micro/data/puddle/learning.json", "this machine has no CUDA device that torch can use; leave it out, or run on a machine"
+    shutil.rmtree(copied / "results")
+    plain = "gns: {config: configs/models/micro_gns.yaml, data: puddle, seeds: [0]}"
+    gpu, films = plain[:-1] + ", resources: {gpus: 1}}", "    films: [grid]"
+    asked = [
+        (study, plain, gpu, "configs/studies/micro.yaml: models.gns.resources.gpus = 1"),
+        (model, "training: {", "training: {device: cuda, ", "configs/models/micro_gns.yaml: training.device = 'cuda'"),
+        (study, films, f"    resources: {{gpus: 1}}\n{films}", "configs/studies/micro.yaml: comparisons.puddle.resources.gpus = 1"),
+    ]
+    for file, old, new, fault in asked:
+        replace(file, old, new)
+        code, output = snakemake(copied)
+        assert code == 2 and output.splitlines()[-1].startswith(f"sluice: {fault}: {remedy}"), output
+        assert "Traceback" not in output and not (copied / data).exists()
+        replace(file, new, old)
+    replace(study, plain, gpu)
+    code, output = snakemake(copied, data)  # asks for none
+    assert code == 0 and (copied / data).exists(), output
+
+
 ON_A_DEVICE = """
 import torch
 from other_device import OtherDevice

@@ -3,7 +3,8 @@
 from learn.compare import compare
 from sim.trajectory import write_json
 from workflow.command import run
-from workflow.contenders import check_device, contenders, settings, test_trajectories
+from workflow.contenders import contenders, settings, test_trajectories
+from workflow.gpu import check_gpu
 from workflow.study import load_study
 
 KINDS = ("reference", "solver", "learned", "trivial", "oracle", "floor")
@@ -11,7 +12,8 @@ KINDS = ("reference", "solver", "learned", "trivial", "oracle", "floor")
 
 def main(path: str, comparison: str, out: str, device: str) -> None:
     study = load_study(path)
-    check_device(study, comparison, device)
+    if device == "cuda":
+        check_gpu(study, "comparisons", comparison)
     trajectories = test_trajectories(study, comparison)
     rows = compare(contenders(study, comparison, trajectories, KINDS, device), trajectories, settings(study, comparison, trajectories))
     if device != "cpu":

@@ -10,13 +10,15 @@ from learn.compare import median_trajectory
 from learn.rollout import rollout_trajectory
 from sim.trajectory import write_shard
 from workflow.command import run
-from workflow.contenders import check_device, learned, test_trajectories
+from workflow.contenders import learned, test_trajectories
+from workflow.gpu import check_gpu
 from workflow.study import load_study
 
 
 def main(path: str, comparison: str, device: str, errors: str, truth: str, *shards: str) -> None:
     study = load_study(path)
-    check_device(study, comparison, device)
+    if device == "cuda":
+        check_gpu(study, "comparisons", comparison)
     films = study.comparisons[comparison]["films"]
     rows = json.loads(Path(errors).read_text())
     number = median_trajectory(rows, films[0])
