@@ -328,12 +328,16 @@ def time_interleaved(contenders: Sequence[Simulator], start: Start, frames: int,
 
 
 def time_comparison(
-    contenders: Sequence[Simulator], trajectory: Trajectory, settings: CompareSettings, frames: int, repeats: int = 5
+    contenders: Sequence[Simulator], trajectory: Trajectory, settings: CompareSettings, frames: int | None = None, repeats: int = 5
 ) -> list[Timing]:
-    """``time_interleaved`` from the start that ``compare`` gives, one contender a name: repeated trainings cost the same."""
+    """``time_interleaved`` from the start that ``compare`` gives, one contender a name: repeated trainings cost the same.
+
+    frames None: all that ``compare`` has predicted, so that times belong to its errors. A solver's first frames are often flight, the cheapest or
+    the dearest of its run."""
     one_each = {contender.name: contender for contender in reversed(contenders)}
-    start = start_from(trajectory, known_frames(contenders, settings))
-    return time_interleaved(list(reversed(one_each.values())), start, frames, repeats)
+    history = known_frames(contenders, settings)
+    frames = len(trajectory.position) - history if frames is None else frames
+    return time_interleaved(list(reversed(one_each.values())), start_from(trajectory, history), frames, repeats)
 
 
 def attach_timing(rows: list[dict], timings: Iterable[Timing], scene: str) -> list[dict]:

@@ -259,7 +259,7 @@ def load_study(path: str | Path) -> Study:
     study = Study(path, content, families, configs)
     for name, entry in content["comparisons"].items():
         content["comparisons"][name] = entry = {"horizons": [1, 5, 20, 100], "films": list(entry["learned"]), "targets": [], "axes": {}, **entry}
-        entry["timing"] = {"repeats": 5, **entry["timing"]}
+        entry["timing"] = {"repeats": 5, **entry.get("timing", {})}
         _check_comparison(study, name, entry)
     for name, entry in content["comparisons"].items():
         if "generalisation" in entry:

@@ -17,7 +17,7 @@ def main(path: str, comparison: str, out: str) -> None:
     wanted = study.comparisons[comparison]["timing"]
     trajectories = test_trajectories(study, comparison, [0])
     rivals = contenders(study, comparison, trajectories, KINDS)
-    timings = time_comparison(rivals, trajectories[0], settings(study, comparison, trajectories), wanted["frames"], wanted["repeats"])
+    timings = time_comparison(rivals, trajectories[0], settings(study, comparison, trajectories), wanted.get("frames"), wanted["repeats"])
     write_json(out, {"timings": plain([dataclasses.asdict(timing) for timing in timings]), "hardware": hardware(), "versions": versions()})
 
 
