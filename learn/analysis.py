@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from learn.compare import BEST_LEARNED, BEST_TRIVIAL, SOLVERS
@@ -65,9 +65,12 @@ def _floor(rows: Sequence[dict], row: dict) -> dict | None:
     return floors[0] if floors else None
 
 
-def _range(row: dict) -> tuple[float, float]:
-    spread = row.get("timing_spread")
-    return tuple(spread["seconds_per_frame"]) if spread else (row["seconds_per_frame"],) * 2
+def _ratios(rung: dict, model: dict) -> list[float]:
+    """Time of the rung over the model's in every round of the interleaved timing; of the figures themselves where they have no rounds in common."""
+    times = [(row.get("timing_spread") or {}).get("rounds", []) for row in (rung, model)]
+    if not times[0] or len(times[0]) != len(times[1]):
+        times = [[row["seconds_per_frame"]] for row in (rung, model)]
+    return [solver / learned for solver, learned in zip(*times, strict=True)]
 
 
 def speed_up_paper(rows: list[dict], model: dict) -> float | None:
@@ -78,11 +81,11 @@ def speed_up_paper(rows: list[dict], model: dict) -> float | None:
 
 def speed_up_at_equal_error(rows: list[dict], model: dict, yardstick: Yardstick = MOVING_MSE) -> dict:
     """{"ratio", "rung", "rung_kind", "outcome"}: time of the cheapest solver rung, the reference included, that errs at most as the model
-    does, over the time of the model. Above 1 the model is the cheaper one.
+    does, over the time of the model (of their medians). Above 1 the model is the cheaper one.
 
-    Errors below the chaos floor mean nothing, so a rung need not be better than the floor. outcome: "wins"; "loses"; "ties" where the spreads
-    of the timings overlap; "worse than trivial" where a trivial baseline errs less, whatever the ratio; "no rung" where no rung is as accurate,
-    the reference not being timed; "failed" where the model's error or time is unknown or one of its rollouts failed.
+    Errors below the chaos floor mean nothing, so a rung need not be better than the floor. outcome: "wins" or "loses" where every round of
+    the interleaved timing says so, else "ties"; "worse than trivial" where a trivial baseline errs less, whatever the ratio; "no rung" where
+    none is as accurate, the reference not being timed; "failed" where the model's error or time is unknown or one of its rollouts failed.
     """
     nothing = {"ratio": None, "rung": None, "rung_kind": None}
     error = yardstick.of(model)
@@ -94,12 +97,12 @@ def speed_up_at_equal_error(rows: list[dict], model: dict, yardstick: Yardstick 
     if not enough:
         return nothing | {"outcome": "no rung"}
     rung = min(enough, key=lambda row: row["seconds_per_frame"])
-    (model_low, model_high), (rung_low, rung_high) = _range(model), _range(rung)
+    ratios = _ratios(rung, model)
     if worse_than_trivial(rows, model, yardstick):
         outcome = "worse than trivial"
-    elif rung_low > model_high:
+    elif min(ratios) > 1:
         outcome = "wins"
-    elif model_low > rung_high:
+    elif max(ratios) < 1:
         outcome = "loses"
     else:
         outcome = "ties"
@@ -160,11 +163,13 @@ def over_floor(rows: Sequence[dict], row: dict, metric: str = "rollout_mse_movin
 def analyse(rows: list[dict], yardstick: Yardstick = MOVING_MSE) -> list[dict]:
     """Everything above for every learned row, JSON-able. Break-even needs ``row["cost"]`` = {"generation_seconds", "training_seconds"}.
 
-    It is reckoned per rollout of the test's length, against the rung of ``equal_error`` and against the reference; None where unknown.
+    It is reckoned per rollout of the test's length, against the rung of ``equal_error`` and against the reference; None where unknown, and for a
+    tie. ``equal_error_mean``: ``equal_error`` by means over the trajectories in place of medians, which a few bad rollouts do not move.
     """
     result = []
     for model in (row for row in rows if row["kind"] == "learned"):
         equal = speed_up_at_equal_error(rows, model, yardstick)
+        means = replace(yardstick, over="mean")
         paper = speed_up_paper(rows, model)
 
         def even(ratio: float | None, model: dict = model) -> float | str | None:
@@ -184,8 +189,9 @@ def analyse(rows: list[dict], yardstick: Yardstick = MOVING_MSE) -> list[dict]:
                 "seconds_per_frame": model["seconds_per_frame"],
                 "speed_up_paper": paper,
                 "equal_error": equal,
+                "equal_error_mean": speed_up_at_equal_error(rows, model, means),
                 "equal_time": error_at_equal_time(rows, model, yardstick),
-                "break_even": even(equal["ratio"]),
+                "break_even": None if equal["outcome"] == "ties" else even(equal["ratio"]),
                 "break_even_reference": even(paper),
                 "worse_than_trivial": worse_than_trivial(rows, model, yardstick),
                 "over_floor": over_floor(rows, model),
@@ -319,13 +325,14 @@ def _best_model(where: str, best: dict, by_name: dict[str, dict]) -> list[str]:
         if equal["outcome"] == "wins":
             who = f"{name} wins at equal error, {number(ratio)} times faster than the solver"
         elif equal["outcome"] == "ties":
-            who = f"no learned model wins at equal error; {name} ties with the solver within the spread of the timings"
+            who = f"no learned model wins at equal error; {name} ties with the solver: the rounds of the timing disagree on who is faster"
         else:
             who = f"no learned model wins at equal error; the solver is {number(1 / ratio)} times faster than the best, {name}"
         match = f"{rung['contender']}, the cheapest solver rung at least as accurate, {duration(rung['seconds_per_frame'])}"
         if rung["kind"] == "reference":
             match += " (it is the reference itself: no cheaper rung reaches that error)"
         sentences.append(f"{where}, {who}: {its}, {match}.")
+        sentences += _by_the_mean(equal, best["equal_error_mean"])
     if best["speed_up_paper"] is not None:
         sentences.append(f"Against the reference, accuracy aside, {name} is {number(best['speed_up_paper'])} times as fast.")
     cost = row.get("cost")
@@ -340,6 +347,21 @@ def _best_model(where: str, best: dict, by_name: dict[str, dict]) -> list[str]:
     if best["over_floor"]["all"] is not None:
         sentences.append(f"Its MSE over all frames is {number(best['over_floor']['all'])} times the chaos floor.")
     return sentences
+
+
+def _by_the_mean(median: dict, mean: dict) -> list[str]:
+    """A sentence where the mean of the errors, which every bad rollout moves, says something else than their median."""
+    if mean["outcome"] == median["outcome"] and mean["ratio"] is not None and abs(math.log(mean["ratio"] / median["ratio"])) < 0.1:
+        return []
+    said = {
+        "wins": f"it wins by {number(mean['ratio'] or 1)}",
+        "ties": "it ties",
+        "loses": f"the solver is {number(1 / (mean['ratio'] or 1))} times faster",
+        "worse than trivial": "it is worse than a trivial baseline",
+        "no rung": "no rung is as accurate",
+        "failed": "it failed",
+    }
+    return [f"By the mean of the errors in place of their median, {said[mean['outcome']]}."]
 
 
 def _headline(groups: dict[tuple[str, str], list[dict]], yardstick: Yardstick) -> list[str]:
@@ -365,7 +387,7 @@ def _headline(groups: dict[tuple[str, str], list[dict]], yardstick: Yardstick) -
         lost = f"{len(where['loses'])} the solver is faster" if wins else f"{len(where['loses'])} the best loses to the solver"
         sentences.append(f"On {lost}, by the least on {place}, where {model} takes {number(1 / ratio)} times as long.")
     for outcome, text in (
-        ("ties", "the best ties with the solver within the spread of the timings"),
+        ("ties", "the best ties with the solver: the rounds of the timing disagree on who is faster"),
         ("no rung", "no solver rung that was timed is as accurate"),
         ("worse than trivial", "the best is worse than a trivial baseline"),
         ("failed", "none finished every rollout"),

@@ -158,48 +158,59 @@ def _soft_minimum(cost: np.ndarray, potential: np.ndarray, epsilon: float) -> np
 
 #: The dual objective of entropic transport is within this share of epsilon of its maximum.
 _TRANSPORT_TOLERANCE = 1e-6
+#: The same while epsilon is lowered: a start for the next.
+_SCALE_TOLERANCE = 1e-2
+#: Of the Newton steps, in shares of a particle's weight.
+_LEAST_DAMPING = 1e-12
 
 
 def entropic_transport(p: np.ndarray, q: np.ndarray, epsilon: float, period: np.ndarray | None = None) -> float:
     """OT(p, q) = min over plans of <plan, |p_i - q_j|^2> + epsilon KL(plan | uniform product), length^2; NaN if it does not converge.
 
-    Uniform weights. Log-domain Sinkhorn steps while epsilon is lowered from the squared diameter, then Newton steps on the dual (Brauer et
-    al. 2017), without which clouds with a droplet several sqrt(epsilon) apart would take thousands of Sinkhorn steps.
+    Uniform weights. Newton's method on the dual (Brauer et al. 2017), as clouds with a droplet several sqrt(epsilon) apart would take
+    thousands of Sinkhorn steps, while epsilon is lowered from the squared diameter. Droplets that nearly nothing joins leave the curvature almost
+    singular: steps are damped (Levenberg 1944, Marquardt 1963) until they gain a tenth of what the quadratic model promises.
     """
     cost = _costs(p, q, "sqeuclidean", period)
     rows, columns = cost.shape
-    g = np.zeros(columns)
-    scale = max(float(cost.max()), epsilon)
+    g, largest = np.zeros(columns), float(cost.max())
+    scale = max(largest, epsilon)
     while True:
-        for _ in range(2):
+        tolerance = (_TRANSPORT_TOLERANCE if scale == epsilon else _SCALE_TOLERANCE) * scale
+        damping = _LEAST_DAMPING
+        for _ in range(100):
             f = _soft_minimum(cost, g, scale)
             g = _soft_minimum(cost.T, f, scale)
-        if scale == epsilon:
-            break
-        scale = max(scale / 4, epsilon)
-    for _ in range(30):
-        f = _soft_minimum(cost, g, epsilon)
-        g = _soft_minimum(cost.T, f, epsilon)
-        # g is optimal for f, so the columns of the plan are exact and mean(f) + mean(g) is the dual objective, a concave function of f.
-        value = f.mean() + g.mean()
-        with np.errstate(all="ignore"):
-            plan = np.exp((f[:, None] + g - cost) / epsilon) / (rows * columns)
-            sums = plan.sum(axis=1)
-            curvature = np.diag(sums) - columns * plan @ plan.T
-        if not np.isfinite(curvature).all():
-            return math.nan
-        # A constant added to f changes nothing and parts that nothing joins hardly anything: both are fixed without moving the maximum.
-        curvature += 1 / rows**2 + 1e-12 / rows * np.eye(rows)
-        step = epsilon * np.linalg.solve(curvature, 1 / rows - sums)
-        gain = 0.5 * float((1 / rows - sums) @ step)
-        if gain <= _TRANSPORT_TOLERANCE * epsilon:
-            return float(value)
-        for length in 0.5 ** np.arange(10):
-            trial = _soft_minimum(cost.T, f + length * step, epsilon)
-            if (f + length * step).mean() + trial.mean() > value + 0.1 * length * gain:
-                f, g = f + length * step, trial
+            # g is optimal for f, so the columns of the plan are exact and mean(f) + mean(g) is the dual objective, a concave function of f.
+            value = f.mean() + g.mean()
+            with np.errstate(all="ignore"):
+                plan = np.exp((f[:, None] + g - cost) / scale) / (rows * columns)
+                missing = 1 / rows - plan.sum(axis=1)
+                # A constant added to f changes nothing; it is fixed without moving the maximum.
+                curvature = np.diag(plan.sum(axis=1)) - columns * plan @ plan.T + 1 / rows**2
+            if not np.isfinite(curvature).all():
+                return math.nan
+            # Concave, and the best f is within the range of the costs: this is all that can be gained.
+            if converged := np.abs(missing).sum() * largest <= tolerance:
                 break
-    return math.nan
+            while damping < 1:
+                step = scale * np.linalg.solve(curvature + damping / rows * np.eye(rows), missing)
+                gain = 0.5 * float(missing @ step)
+                if converged := gain <= tolerance and damping == _LEAST_DAMPING:
+                    break
+                trial = _soft_minimum(cost.T, f + step, scale)
+                if (f + step).mean() + trial.mean() > value + 0.1 * gain:
+                    f, g, damping = f + step, trial, max(damping / 10, _LEAST_DAMPING)
+                    break
+                damping *= 10
+            if converged:
+                break
+            damping = min(damping, 0.1)  # where no step gains, the next Sinkhorn step does
+        if not converged:
+            return math.nan
+        if scale == epsilon:
+            return float(value)
+        scale = max(scale / 4, epsilon)
 
 
 def _self_transport(p: np.ndarray, epsilon: float, period: np.ndarray | None = None) -> float:

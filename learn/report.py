@@ -111,7 +111,7 @@ class _Table:
 
 
 def _share(value: float) -> str:
-    return "0" if value == 0 else f"{100 * value:.2g} %"
+    return "0" if value == 0 else f"{number(100 * value)} %"
 
 
 # Tables ---------------------------------------------------------------------------------------------------------------------
@@ -222,6 +222,32 @@ def _contenders(rows: Sequence[dict]) -> _Table:
     return table
 
 
+#: Cloud metrics beside those of ``_contenders``: heading, key.
+_CLOUDS = {
+    "density, mean": "density_error_mean",
+    "density, greatest": "density_error_max",
+    "centre of mass, spacings": "centre_of_mass_error",
+    "front, spacings": "front_error",
+    "width": "width_ratio",
+    "height": "height_ratio",
+    "pile angle, degrees": "pile_angle_error",
+}
+
+
+def _clouds(rows: Sequence[dict]) -> _Table:
+    """What a rollout looks like where its particles no longer say anything: density, centre of mass, extents, slope; momentum."""
+    table = _Table(
+        "Clouds at ¼, ½, ¾ and the end of the run, beside the truth's",
+        [*_CLOUDS, "momentum drift"],
+        [("error of the", 4), ("over the true", 2), ("error of the", 1), ("worst frame", 1)],
+    )
+    for heading, row in _with_headings(rows):
+        drift = row.get("momentum_drift")
+        cells = [_clouds_cell(table, row, key) for key in _CLOUDS.values()]
+        table.rows.append(_Row(row["contender"], [*cells, table.missing(_failure(row)) if drift is None else _Cell(number(drift))], heading))
+    return table
+
+
 def _time_cells(table: _Table, row: Mapping) -> list[_Cell]:
     """Seconds per frame with its range, per simulated second, compile time."""
     seconds, compiling = row.get("seconds_per_frame"), row.get("compile_seconds")
@@ -255,6 +281,11 @@ def _rollouts(value: float | str | None, table: _Table, reason: str) -> _Cell:
     return _Cell(value if isinstance(value, str) else f"{math.ceil(float(f'{value:.3g}')):,}")
 
 
+def _ratio(equal: Mapping) -> _Cell:
+    """A speed-up at equal error over its outcome."""
+    return _Cell(_DASH if equal["ratio"] is None else f"{number(equal['ratio'])}×", _OUTCOMES.get(equal["outcome"], equal["outcome"]))
+
+
 def _speed_ups(entries: Sequence[dict]) -> _Table:
     """What the learning bought, one row per learned contender."""
     table = _Table(
@@ -263,6 +294,7 @@ def _speed_ups(entries: Sequence[dict]) -> _Table:
             "over the reference, accuracy aside",
             "at equal error",
             "against",
+            "in the mean",
             "model's error",
             "rung's error",
             "ratio",
@@ -270,19 +302,19 @@ def _speed_ups(entries: Sequence[dict]) -> _Table:
             "at equal error",
             "over the reference",
         ],
-        [("speed-up", 3), ("error at equal time", 4), ("break-even, rollouts", 2)],
+        [("speed-up", 4), ("error at equal time", 4), ("break-even, rollouts", 2)],
     )
     for entry in entries:
-        equal, rival = entry["equal_error"], entry["equal_time"]
-        outcome = _OUTCOMES.get(equal["outcome"], equal["outcome"])
+        equal, mean, rival = entry["equal_error"], entry["equal_error_mean"], entry["equal_time"]
         paper, error = entry["speed_up_paper"], entry["error"]
         unrivalled = "no solver rung is as cheap" if rival["rung"] is None else "the rung's error is zero"
         unrivalled = "some rollouts failed" if error is None else unrivalled
-        unpaid = "no such speed-up, or the cost of data and training is unknown"
+        unpaid = "a tie, no such speed-up, or the cost of data and training is unknown"
         cells = [
             table.missing("reference not timed") if paper is None else _Cell(f"{number(paper)}×"),
-            _Cell(_DASH, outcome) if equal["ratio"] is None else _Cell(f"{number(equal['ratio'])}×", outcome),
+            _ratio(equal),
             _Cell(equal["rung"] or _DASH),
+            _ratio(mean),
             table.missing("some rollouts failed") if error is None else _Cell(number(error)),
             table.missing("no solver rung is as cheap") if rival["rung"] is None else _Cell(number(rival["error"])),
             table.missing(unrivalled) if rival["ratio"] is None else _Cell(f"{number(rival['ratio'])}×"),
@@ -333,8 +365,9 @@ def _costs(rows: Sequence[dict]) -> _Table | None:
 
 def _glance(scenes: Sequence[dict], folder: str) -> _Table:
     """One row a scene: its best learned model beside the best trivial baseline and the solver."""
-    columns = ["best learned", "its error", "best trivial", "per frame", "at equal error", "against", "over the reference", "break-even, rollouts"]
-    table = _Table(f"At a glance; error: {MOVING_MSE}", columns, [("accuracy", 3), ("run time", 1), ("speed-up", 3), ("", 1)], head="scene")
+    columns = ["best learned", "its error", "best trivial", "per frame", "at equal error", "against", "in the mean", "over the reference",
+               "break-even, rollouts"]  # fmt: skip
+    table = _Table(f"At a glance; error: {MOVING_MSE}", columns, [("accuracy", 3), ("run time", 1), ("speed-up", 4), ("", 1)], head="scene")
     for scene in scenes:
         rows, entries, link = scene["rows"], scene["analysis"], f"{folder}/{scene['slug']}.html"
         tag = f"truth: {rows[0]['reference']}"
@@ -352,8 +385,9 @@ def _glance(scenes: Sequence[dict], folder: str) -> _Table:
             _Cell(duration(best["seconds_per_frame"])),
             speed[1],
             speed[2],
+            speed[3],
             table.missing("reference not timed") if best["speed_up_paper"] is None else speed[0],
-            table.missing("what data and training cost is unknown, or nothing is saved") if speed[7].text == _DASH else speed[7],
+            table.missing("a tie, nothing is saved, or what data and training cost is unknown") if speed[8].text == _DASH else speed[8],
         ]
         table.rows.append(_Row(scene["name"], cells, tag=tag, link=link))
     return table
@@ -461,7 +495,7 @@ def _page(scene: Mapping, media: SceneAssets) -> dict:
         f"{first['frames']} predicted frames of {duration(first['frame_step'])}" if first.get("frames") and first.get("frame_step") else "",
         f"{first['known_frames']} known frames" if first.get("known_frames") else "",
     ]
-    tables = [_contenders(rows), _speed_ups(entries) if entries else None, _floors(rows), _costs(rows)]
+    tables = [_contenders(rows), _speed_ups(entries) if entries else None, _clouds(rows), _floors(rows), _costs(rows)]
     main, films = _embed(media.main), _embed(media.films)
     still = [_Media(film.poster, "still", f"{film.caption} Half way.", None, False) for film in films[:1] if film.poster]
     holds = ["films" if films else "", "curves over time" if media.figures else "", "trainings" if media.training else "", "settings"]
@@ -499,6 +533,7 @@ def write_report(summary: Mapping, path: str | Path, assets: Mapping[str, SceneA
     left = dict(assets or {})
     pages = [_page(scene, left.pop(scene["rows"][0]["scene"], SceneAssets())) for scene in scenes]
     hardware = summary.get("hardware") or {}
+    elsewhere = sorted({device for row in rows if (device := row.get("settings", {}).get("rolled out on"))})
     provenance = {name: summary.get(name) or {} for name in ("hardware", "versions")} | (summary.get("provenance") or {})
     here = Path(__file__).parent
     entry = render(
@@ -514,7 +549,7 @@ def write_report(summary: Mapping, path: str | Path, assets: Mapping[str, SceneA
         jobs=_jobs(summary["jobs"]) if summary.get("jobs") else None,
         provenance={name: content for name, content in provenance.items() if content},
     )
-    machine = ", ".join(words(hardware[key]) for key in ("cpu", "gpu") if hardware.get(key)) or "an unknown machine"
+    machine = f"one thread of {words(hardware['cpu'])}" if hardware.get("cpu") else "an unknown machine"
     with atomic_folder(folder) as temporary:
         for page in pages:
             text = render(
@@ -525,6 +560,7 @@ def write_report(summary: Mapping, path: str | Path, assets: Mapping[str, SceneA
                 page=page,
                 pages=pages,
                 machine=machine,
+                elsewhere=", ".join(elsewhere),
                 provenance={},
             )
             (temporary / f"{page['slug']}.html").write_bytes(text)

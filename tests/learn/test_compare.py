@@ -207,7 +207,11 @@ def test_timing_is_interleaved_warm_and_without_compilation(clock):
     assert block.seconds_per_frame == pytest.approx(0.2)  # two calls of four frames: eight frames were paid for
     rows = c.attach_timing(c.compare([Off("one", TRUTHS, 0)], TRUTHS, SETTINGS), [one, block], "hand")
     assert rows[0]["seconds_per_frame"] == pytest.approx(0.5) and rows[0]["seconds_per_simulated_second"] == pytest.approx(50)
-    assert rows[0]["compile_seconds"] == pytest.approx(5) and rows[0]["timing_spread"] == {"seconds_per_frame": pytest.approx([0.5, 0.5]), "n": 5}
+    assert rows[0]["compile_seconds"] == pytest.approx(5) and rows[0]["timing_spread"] == {
+        "seconds_per_frame": pytest.approx([0.5, 0.5]),
+        "n": 5,
+        "rounds": pytest.approx([0.5] * 5),
+    }
 
 
 def test_timing_of_failures_and_too_few_repeats(clock):
@@ -244,8 +248,9 @@ def row(name, kind, error, seconds, spread=0.0, failures=0, **more):
         "status": f"failed in {failures} of 10: non-finite position (frame 9)" if failures else "ok",
         "rollout_mse_moving": {"20": None if error is None else error / 4, "all": error},
         "emd": {"0.5": 1.0, "1": 2.0},
+        "mean": {"rollout_mse_moving": {"all": error}, "emd": {"1": 2.0}},
         "seconds_per_frame": seconds,
-        "timing_spread": {"seconds_per_frame": [seconds * (1 - spread), seconds * (1 + spread)], "n": 5},
+        "timing_spread": {"rounds": [seconds * (1 + spread * side) for side in (-1, 0, 1, 0, -1)], "n": 5},
         **more,
     }
 
@@ -310,6 +315,42 @@ def test_a_tie_within_the_spread():
     model = row("gns", "learned", 1e-3, 0.9, spread=0.2)
     assert a.speed_up_at_equal_error([*LADDER, model], model)["outcome"] == "ties"
     assert "no learned model wins at equal error; gns ties" in a.verdict([*LADDER, model])
+
+
+def test_every_round_must_agree_on_the_winner():
+    """A single slow run of the solver makes no tie, rounds of both signs do, whatever the medians."""
+
+    def outcome(*rounds):
+        model = row("gns", "learned", 1e-3, 0.5) | {"timing_spread": {"rounds": list(rounds), "n": 5}}
+        rung = row("coarse", "solver", 1e-4, 1.0) | {"timing_spread": {"rounds": [1.0, 1.0, 1.0, 1.0, 9.0], "n": 5}}
+        return a.speed_up_at_equal_error([TEACHER, rung, model], model)["outcome"]
+
+    assert outcome(0.5, 0.5, 0.5, 0.5, 4.0) == "wins"  # slow together: the ranges overlap, no round is lost
+    assert outcome(0.5, 0.5, 0.5, 1.1, 0.5) == "ties"
+    assert outcome(1.1, 1.1, 1.1, 1.1, 9.9) == "loses"
+
+
+def test_means_that_say_something_else():
+    model = row("gns", "learned", 1e-3, 0.5, mean={"rollout_mse_moving": {"all": 2e-2}})
+    (result,) = a.analyse([*LADDER, model])
+    assert (result["equal_error"]["rung"], result["equal_error_mean"]["rung"]) == ("coarse", "worst")
+    assert (result["equal_error"]["outcome"], result["equal_error_mean"]["outcome"]) == ("wins", "ties")
+    assert (
+        "gns wins at equal error, 2 times" in (text := a.verdict([*LADDER, model]))
+        and "By the mean of the errors in place of their median, it ties." in text
+    )
+    slower = row("gns", "learned", 1e-3, 0.9, mean={"rollout_mse_moving": {"all": 2e-2}})
+    assert "place of their median, the solver is 1.8 times faster." in a.verdict([*LADDER, slower])
+    lost = row("gns", "learned", 1e-3, 0.5, mean={"rollout_mse_moving": {"all": 0.5}})
+    assert "place of their median, it is worse than a trivial baseline." in a.verdict([*LADDER, *TRIVIAL, lost])
+    assert "place of their median" not in a.verdict([*LADDER, row("gns", "learned", 1e-3, 0.5)])
+
+
+def test_whole_rollouts_are_timed_unless_a_study_says_less(clock):
+    contenders = [Ticking("one", clock, 0.5), Ticking("block", clock, 0.8, block=4)]
+    timings = c.time_comparison(contenders, TRUTHS[0], SETTINGS)
+    assert {timing.frames for timing in timings} == {len(TRUTHS[0].position) - c.known_frames(contenders, SETTINGS)}
+    assert {timing.frames for timing in c.time_comparison(contenders, TRUTHS[0], SETTINGS, 3)} == {3}
 
 
 def test_failures_win_nothing():

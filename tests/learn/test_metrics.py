@@ -136,6 +136,18 @@ def test_sinkhorn_of_droplets_that_nothing_joins():
     assert metrics.sinkhorn_divergence(p, q, epsilon=0.002) == pytest.approx(0.25 / 3, abs=0.002)
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_sinkhorn_of_splashes(seed):
+    """A layer and fifty drops up to tens of sqrt(epsilon) apart: where undamped Newton steps ran away."""
+    random, epsilon = np.random.default_rng(seed), 0.015**2
+    p, q = (np.concatenate([random.random((250, 2)) * [0.8, 0.15], random.random((50, 2)) * 0.8]) for _ in range(2))
+    assert metrics.sinkhorn_divergence(p, p, epsilon) == pytest.approx(0, abs=3e-6 * epsilon)
+    value = metrics.sinkhorn_divergence(p, q, epsilon)
+    exact = (metrics.cdist(p, q, "sqeuclidean")[metrics.linear_sum_assignment(metrics.cdist(p, q, "sqeuclidean"))]).mean()
+    assert 0 < value < exact + 3e-6 * epsilon
+    assert value == pytest.approx(metrics.sinkhorn_divergence(q, p, epsilon), abs=3e-6 * epsilon)
+
+
 def test_sinkhorn_says_when_it_does_not_converge():
     p = np.random.default_rng(0).normal(size=(20, 2))
     assert math.isnan(metrics.sinkhorn_divergence(p, p * 1e12, epsilon=1e-3))

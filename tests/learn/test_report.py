@@ -198,8 +198,9 @@ def test_scenes_at_a_glance(tmp_path, rows):
     text, page = write(tmp_path, rows + failed, page=None)
     table = page.table("At a glance; error: rollout MSE of moving particles over all frames")
     trivial = analysis.MOVING_MSE.of(next(row for row in rows if row["contender"] == "frozen"))
-    assert table["hand"] == ["hand | truth: teacher", "gns", "4.0e-4", report.number(trivial), "3 ms", "0.33× | loses", "rung", "3×", "never"]
-    assert table["mud"][1:] == ["–^1", *["–"] * 7] and "none finished every rollout" in text
+    assert table["hand"][:5] == ["hand | truth: teacher", "gns", "4.0e-4", report.number(trivial), "3 ms"]
+    assert table["hand"][5:] == ["0.33× | loses", "rung", "0.33× | loses", "3×", "never"]
+    assert table["mud"][1:] == ["–^1", *["–"] * 8] and "none finished every rollout" in text
     assert "None of these scenes is one of the sixteen domains" in text
 
 
@@ -229,8 +230,8 @@ def test_what_the_steps_took(tmp_path, rows):
 
 def test_every_table_scrolls_in_its_own_box(tmp_path, rows):
     text, page = write(tmp_path, rows)
-    assert text.count("<table>") == len(page.tables) == 4
-    assert text.count('<div class="scroll"') == 4
+    assert text.count("<table>") == len(page.tables) == 5
+    assert text.count('<div class="scroll"') == 5
     for table in page.tables.values():
         assert len({len(row) for row in table[1:] if len(row) > 2}) == 1  # the first row groups columns, headings of kinds span them
 
@@ -284,13 +285,35 @@ def test_speed_ups_floor_and_costs(tmp_path, rows):
     _, page = write(tmp_path, rows)
     gns, dead = (page.table("What the learning bought")[name] for name in ("gns", "dead"))
     assert gns[1:4] == ["3×", "0.33× | loses", "rung"]
-    assert gns[4:8] == ["4.0e-4", "1.0e-4", "4×", "rung"]
-    assert gns[8:] == ["never", "11,500"]  # (90 + 600) s over 10 frames of (9 - 3) ms
-    assert dead[2] == "– | failed" and dead[4].startswith("–^")
+    assert gns[4:9] == ["0.33× | loses", "4.0e-4", "1.0e-4", "4×", "rung"]
+    assert gns[9:] == ["never", "11,500"]  # (90 + 600) s over 10 frames of (9 - 3) ms
+    assert dead[2] == "– | failed" and dead[5].startswith("–^")
     over = page.table("MSE over the chaos floor")
     assert over["gns"][-1] == "400×" and over["rung"][-1] == "100×" and "teacher" not in over
     cost = page.table("Cost of data and training")
     assert cost["gns"][1:] == ["90 s", "10 min", "100"] and cost["contender"][-1] == "trajectories"
+
+
+def test_clouds(tmp_path, rows):
+    _, page = write(tmp_path, rows)
+    table = page.table("Clouds at")
+    row = next(row for row in rows if row["contender"] == "gns")
+    quarters = ("0.25", "0.5", "0.75", "1")
+    for heading, key in {"density, mean": "density_error_mean", "front, spacings": "front_error", "height": "height_ratio"}.items():
+        shown = " / ".join("–" if row[key][at] is None else report.number(row[key][at]) for at in quarters)
+        assert table["gns"][table["contender"].index(heading)] == shown, heading
+    assert table["gns"][-1] == report.number(row["momentum_drift"]) and table["dead"][1].startswith("–^")
+    # Moved by 0.02 along every axis, in spacings.
+    assert table["gns"][table["contender"].index("centre of mass, spacings")] == " / ".join([report.number(row["centre_of_mass_error"]["1"])] * 4)
+
+
+def test_a_gpu_that_only_rolled_out_is_not_what_was_timed(tmp_path, rows):
+    machine = {"cpu": "Some CPU", "gpu": "Some GPU"}
+    text, _ = write(tmp_path, rows, hardware=machine)
+    assert "Timed on one thread of Some CPU. " in text and "Some GPU" not in text
+    there = [row | {"settings": row["settings"] | {"rolled out on": "Some GPU"}} if row["kind"] == "learned" else row for row in rows]
+    text, _ = write(tmp_path, there, hardware=machine)
+    assert "Timed on one thread of Some CPU; errors and films of learned models: Some GPU. " in text
 
 
 def test_analysis_of_the_summary_is_used_as_it_is(tmp_path, rows):

@@ -259,6 +259,8 @@ def test_a_comparison_on_a_device_is_that_of_the_cpu(copied):
         assert (row["contender"], row["runs"], row["failures"]) == (other["contender"], other["runs"], other["failures"])
         if row["kind"] == "learned":
             assert row["settings"]["rolled out on"] == "none at all" and row["seconds_per_frame"] is None and other["seconds_per_frame"] > 0
+            told = [row["mean"], row["spread"]["min"], row["spread"]["max"], *row["spread"]["per_seed"], *row["spread"]["per_trajectory"]]
+            assert {figures["seconds_per_frame"] for figures in told} == {None}
             for name in ("one_step_mse", "rollout_mse_moving", "spacing_ratio"):
                 assert row[name] == pytest.approx(other[name], rel=1e-3)
     assert [row["contender"] for row in found if row["kind"] == "learned"] == ["gns", "grid"]

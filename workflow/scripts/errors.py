@@ -21,6 +21,9 @@ def main(path: str, comparison: str, out: str, device: str) -> None:
         for row in rows:
             if row["kind"] == "learned":
                 row |= {"seconds_per_frame": None, "seconds_per_simulated_second": None}
+                spread = row["spread"]
+                for figures in (row["mean"], spread["min"], spread["max"], *spread["per_seed"], *spread["per_trajectory"]):
+                    figures["seconds_per_frame"] = None
     write_json(out, rows)
 
 
