@@ -61,15 +61,21 @@ def test_methods_say_what_they_do_or_keep_a_contract():
     assert not missing, "\n".join(missing)
 
 
+#: Of dimensions, in brackets: [particles, dim], [frames], [n], [...]; no unit, no interval of numbers.
+SHAPE = re.compile(r"\[(?:\.\.\.|dim|[knAEFN]|[a-z]+s|[^\]\n]*[a-zA-Z][^\]\n]*,[^\]\n]*)\]")
+
+
 def test_functions_of_arrays_state_a_shape():
-    """In their own docstring or once for all at the head of the module, in brackets: [particles, dim]. Cases of known answer are apart: they plot."""
+    """In their own docstring or once for all at the head of the module. Cases of known answer are apart: they plot."""
+    assert all(SHAPE.search(text) for text in ("[particles, dim]", "[frames]", "[N, 2^d]", "[...]", "[k]"))
+    assert not any(SHAPE.search(text) for text in ("[length]", "[0, 1]", "[m/s]", "[J]", "[-1, 1]"))
     missing = []
     for where, path, kind, node in everything():
         if kind is not None or path.parts[0] == "workflow" or path.parts[:2] in (("sim", "validation"), ("sim", "stability")):
             continue
         hints = [argument.annotation for argument in (*node.args.args, *node.args.kwonlyargs)] + [node.returns]
         said = (ast.get_docstring(node) or "") + (ast.get_docstring(MODULES[path]) or "")
-        if any(hint is not None and re.search(r"\b(ndarray|Tensor)\b", ast.unparse(hint)) for hint in hints) and not re.search(r"\[[^\]\n]+\]", said):
+        if any(hint is not None and re.search(r"\b(ndarray|Tensor)\b", ast.unparse(hint)) for hint in hints) and not SHAPE.search(said):
             missing.append(where)
     assert not missing, "\n".join(missing)
 

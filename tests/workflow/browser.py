@@ -1,4 +1,7 @@
-"""A page in a real browser without a window: what it says on the console, which pictures load, whether it is wider than the screen."""
+"""A page in a real browser without a window: what it says on the console, which pictures load, whether it is wider than the screen.
+
+``python tests/workflow/browser.py PAGE ...`` looks at pages that are there.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,8 @@ import os
 import shutil
 import signal
 import subprocess
+import sys
+import tempfile
 import threading
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -112,3 +117,9 @@ def check(page: Path, folder: Path) -> Seen:
         seen = look(page.read_text(encoding="utf-8"), folder / f"{page.stem}-{width}", width)
         assert not seen.faults and seen.width <= width, (page, width, seen)
     return seen
+
+
+if __name__ == "__main__":
+    with tempfile.TemporaryDirectory() as place:
+        for argument in sys.argv[1:]:
+            print(f"{argument}: well, {len(check(Path(argument), Path(place)).media)} pictures and films")

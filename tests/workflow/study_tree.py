@@ -141,6 +141,14 @@ def promised(results: Path) -> dict[str, object]:
         elif path.suffix == ".csv":
             kept[name] = [{key: value for key, value in row.items() if key != "seconds"} for row in csv.DictReader(path.read_text().splitlines())]
         elif path.name == "errors.json":
-            keys = ("contender", "one_step_mse", "rollout_mse", "kinetic_energy_mse", "trajectories")
-            kept[name] = [{key: row[key] for key in keys} for row in json.loads(path.read_text())]
+            kept[name] = _without_times(json.loads(path.read_text()))
     return kept
+
+
+def _without_times(rows):
+    """All that a row tells but run times."""
+    if isinstance(rows, list):
+        return [_without_times(row) for row in rows]
+    if isinstance(rows, dict):
+        return {key: _without_times(value) for key, value in rows.items() if not key.startswith("seconds_per_")}
+    return rows
