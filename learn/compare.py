@@ -341,8 +341,8 @@ def time_comparison(
 
 
 def attach_timing(rows: list[dict], timings: Iterable[Timing], scene: str) -> list[dict]:
-    """New rows in which the contenders timed on ``scene`` have the interleaved figures: median, and in ``timing_spread`` [min, max], n and every
-    round's figure: those of one round were taken one after the other."""
+    """New rows in which the contenders timed on ``scene`` have the interleaved figures: median, and in ``timing_spread`` [min, max], n, every
+    round's figure (those of one round were taken one after the other) and the frames that were timed."""
     known = {timing.contender: timing for timing in timings}
     result = []
     for row in rows:
@@ -353,7 +353,7 @@ def attach_timing(rows: list[dict], timings: Iterable[Timing], scene: str) -> li
                 "seconds_per_frame": median,
                 "seconds_per_simulated_second": median / timing.frame_step,
                 "compile_seconds": timing.compile_seconds,
-                "timing_spread": {"seconds_per_frame": [low, high], "n": len(timing.per_frame), "rounds": timing.per_frame},
+                "timing_spread": {"seconds_per_frame": [low, high], "n": len(timing.per_frame), "rounds": timing.per_frame, "frames": timing.frames},
                 "timing": f"interleaved, median of {len(timing.per_frame)} warm runs of {timing.frames} frames",
             }
         result.append(row)

@@ -489,11 +489,15 @@ def _page(scene: Mapping, media: SceneAssets) -> dict:
     """All that the templates show of a scene."""
     rows, entries = scene["rows"], scene["analysis"]
     first = rows[0]
+    # A rollout that failed has fewer frames than were asked for.
+    whole = max((row["frames"] for row in rows if row.get("frames")), default=0)
+    timed = {frames for row in rows if (frames := (row.get("timing_spread") or {}).get("frames", whole)) < whole}
     facts = [
         f"truth: {first['reference']}",
         f"{first['trajectories']} test trajectories" if first.get("trajectories") else "",
         f"{first['frames']} predicted frames of {duration(first['frame_step'])}" if first.get("frames") and first.get("frame_step") else "",
         f"{first['known_frames']} known frames" if first.get("known_frames") else "",
+        f"run times of the first {max(timed)}" if timed else "",
     ]
     tables = [_contenders(rows), _speed_ups(entries) if entries else None, _clouds(rows), _floors(rows), _costs(rows)]
     main, films = _embed(media.main), _embed(media.films)

@@ -211,6 +211,7 @@ def test_timing_is_interleaved_warm_and_without_compilation(clock):
         "seconds_per_frame": pytest.approx([0.5, 0.5]),
         "n": 5,
         "rounds": pytest.approx([0.5] * 5),
+        "frames": 6,
     }
 
 

@@ -307,6 +307,12 @@ def test_clouds(tmp_path, rows):
     assert table["gns"][table["contender"].index("centre of mass, spacings")] == " / ".join([report.number(row["centre_of_mass_error"]["1"])] * 4)
 
 
+def test_times_of_fewer_frames_than_the_errors_say_so(tmp_path, rows):
+    assert "run times of" not in write(tmp_path, rows)[0]
+    fewer = [row | {"timing_spread": row["timing_spread"] | {"frames": 4}} if row.get("timing_spread") else row for row in rows]
+    assert "known frames, run times of the first 4</p>" in write(tmp_path, fewer)[0]
+
+
 def test_a_gpu_that_only_rolled_out_is_not_what_was_timed(tmp_path, rows):
     machine = {"cpu": "Some CPU", "gpu": "Some GPU"}
     text, _ = write(tmp_path, rows, hardware=machine)
