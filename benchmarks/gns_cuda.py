@@ -140,7 +140,7 @@ def measure(particles: int, dim: int, batch: int, latent: int, blocks: int, seco
 
     parameters = list(model.parameters())
     ours = TrainingReplay(model, parameters, Adam(parameters, 0.0), {k: v.clone() for k, v in model.state_dict().items()}, 1.0, windows,
-                          windows.position.shape[1])  # fmt: skip
+                          windows.position.shape[1] // batch)  # fmt: skip
     begun = time.perf_counter()
     for _ in range(5):
         radius_graph(windows.position[5], model.radius, windows.example)

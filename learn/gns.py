@@ -16,7 +16,8 @@ Large graphs spend a few per cent of a training step on page faults; MALLOC_TRIM
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
@@ -39,7 +40,7 @@ from sim.trajectory import KINEMATIC_TYPE
 if TYPE_CHECKING:
     from learn.dataset import DataSpec, Windows
     from learn.fused import Search, Shadow
-    from learn.replay import RolloutReplay, TrainingReplay
+    from learn.gns_replay import GNSRoom, RolloutReplay
 
 #: Added to the variance by every LayerNorm (torch's default).
 NORM_EPSILON = 1e-5
@@ -377,11 +378,23 @@ class GNS(nn.Module):
 
         return torch.cuda.get_device_capability(device) >= (9, 0) and fused.supports(self.network)
 
-    def training_replay(self, *arguments) -> TrainingReplay:
-        """``learn.replay.TrainingReplay`` of this model, where it is ``replayable``."""
-        from learn.replay import TrainingReplay
+    def measure(self, windows: Windows) -> list[int]:
+        """Edges of the first graph of ``windows``; at least the particles, as without self edges there may be none at first."""
+        graph = radius_graph(windows.position[self.velocities], self.radius, windows.example, self.options.self_edges)
+        return [max(graph.edges, windows.position.shape[1])]
 
-        return TrainingReplay(self, *arguments)
+    def make_room(self, capacity: list[int], examples: int) -> GNSRoom:
+        """For steps on so many windows, whose graphs have at most ``capacity`` edges (``learn.replay``)."""
+        from learn.gns_replay import GNSRoom
+
+        return GNSRoom(self, np.asarray(self.spec.bounds), examples, *capacity)
+
+    @contextmanager
+    def using(self, room: GNSRoom) -> Iterator[None]:
+        """One training step in ``room``, by the weights as they are now."""
+        room.shadow.refresh()
+        with room.used(self):
+            yield
 
     def calls(self, progress: float) -> int:
         """Model calls the loss is unrolled over at this share of the training."""
@@ -400,6 +413,10 @@ class GNS(nn.Module):
         mean over the calls is returned, which for one call is the paper's loss.
         """
         return self.loss_under(self.noise(windows, generator), windows)
+
+    def pick(self, windows: Windows, generator: torch.Generator) -> Windows:
+        """All of them."""
+        return windows
 
     def noise(self, windows: Windows, generator: torch.Generator) -> Tensor:
         """[C + 1, particles, dim]: of the positions a model is given, as ``loss`` draws it."""
@@ -515,7 +532,7 @@ class GNS(nn.Module):
         return [failed[number] if number in failed else found[number] for number in which]
 
     def _replayed(self, which: list[int]) -> list[np.ndarray | SimulationError]:
-        from learn.replay import RolloutReplay
+        from learn.gns_replay import RolloutReplay
 
         if self._replay is None or self._replay.which != which:
             if self._replay is not None:

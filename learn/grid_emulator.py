@@ -27,6 +27,8 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -151,6 +153,32 @@ class Level:
     coarse: int = 0
 
 
+class NodeRoom:
+    """Occupied nodes of ``examples`` windows in tables of a fixed length, for captured steps (``learn.replay``): nothing waits for their number.
+
+    capacity: rows of each level, to which one is added that everything nowhere belongs to; most [levels] int64: nodes of the fullest grid
+    of each level, those without a row too. The id behind the last one means nowhere. Rows that no node has are read by nobody, so that
+    no gradient enters them.
+    """
+
+    def __init__(self, capacity: list[int], examples: int, device: torch.device):
+        self.capacity, self.examples = capacity, examples
+        self.most = torch.zeros(len(capacity), dtype=torch.int64, device=device)
+
+    def pack(self, level: int, mask: Tensor) -> tuple[Tensor, Tensor]:
+        """Ids [capacity + 1] of the nodes under ``mask`` [ids], nowhere in the rows that are left; row [ids + 1] of each id, for one that is not
+        occupied the row behind the last, which means "empty" to a stencil."""
+        capacity, nowhere = self.capacity[level], len(mask)
+        place = mask.cumsum(0)
+        self.most[level : level + 1] = torch.maximum(self.most[level : level + 1], place[-1:])
+        ids = torch.arange(nowhere, device=mask.device)
+        kept = mask & (place <= capacity)
+        active = torch.full((capacity + 1,), nowhere, device=mask.device)
+        active.scatter_(0, torch.where(kept, place - 1, capacity), torch.where(kept, ids, nowhere))
+        row = torch.where(kept, place - 1, torch.where(mask, capacity, capacity + 1))
+        return active, torch.cat([row, torch.full((1,), capacity, device=mask.device)])
+
+
 class SparseGrid(nn.Module):
     """Index tables of a fixed regular grid and its halvings; finds the occupied nodes of each level.
 
@@ -180,24 +208,32 @@ class SparseGrid(nn.Module):
             self.register_buffer(f"parent{level}", parent, persistent=False)
             self.register_buffer(f"corner{level}", corner, persistent=False)
 
-    def occupy(self, nodes: Tensor, examples: int) -> tuple[Tensor, Tensor, list[Level]]:
+    def occupy(self, nodes: Tensor, examples: int, room: NodeRoom | None = None) -> tuple[Tensor, Tensor, list[Level]]:
         """Levels occupied by ``nodes``, flat finest ids of any shape with ``example * sizes[0]`` added.
 
-        Returns the occupied ids [A] ascending, their row by id [examples * sizes[0]], and the levels, finest first.
+        Returns the occupied ids [A] ascending, their row by id [examples * sizes[0]], and the levels, finest first; with ``room`` the tables of
+        ``NodeRoom``, and ``nodes`` may hold its "nowhere", ``examples * sizes[0]``.
         """
         ids, corner = nodes.reshape(-1), None
         levels: list[Level] = []
         for level, size in enumerate(self.sizes):
-            mask = torch.zeros(examples * size, dtype=torch.bool, device=ids.device)
-            mask[ids] = True
-            active = mask.nonzero().squeeze(1)
-            lookup = torch.full((examples * size,), len(active), device=ids.device)
-            lookup[active] = torch.arange(len(active), device=ids.device)
+            total = examples * size
+            if room is None:
+                mask = torch.zeros(total, dtype=torch.bool, device=ids.device)
+                mask[ids] = True
+                active = mask.nonzero().squeeze(1)
+                lookup = torch.full((total,), len(active), device=ids.device)
+                lookup[active] = torch.arange(len(active), device=ids.device)
+                around = active[:, None] + getattr(self, f"offset{level}")
+            else:
+                mask = torch.zeros(total + 1, dtype=torch.bool, device=ids.device).index_fill_(0, ids, True)
+                active, lookup = room.pack(level, mask[:-1])
+                around = (active[:, None] + getattr(self, f"offset{level}")).clamp(max=total)
             if levels:
                 levels[-1] = Level(levels[-1].neighbours, lookup[ids] * 2**self.dim + corner, len(active))
             else:
                 finest, rows = active, lookup
-            levels.append(Level(lookup[active[:, None] + getattr(self, f"offset{level}")]))
+            levels.append(Level(lookup[around]))
             if level + 1 < len(self.sizes):
                 example, local = active // size, active % size
                 ids, corner = getattr(self, f"parent{level}")[local] + example * self.sizes[level + 1], getattr(self, f"corner{level}")[local]
@@ -281,18 +317,20 @@ class GridEmulator(nn.Module):
         self.register_buffer("corner_ids", self.corners @ self.grid.stride0, persistent=False)
         self.register_buffer("nodes", torch.tensor(nodes), persistent=False)
         self.register_buffer("types", torch.tensor(spec.particle_types), persistent=False)
-        # A data set may hold kinematic particles alone.
-        self.register_buffer("moving", torch.tensor([kind for kind in spec.particle_types if kind != KINEMATIC_TYPE] or [KINEMATIC_TYPE]),
-                             persistent=False)  # fmt: skip
         previewed = [max(round(share * m), 1) - 1 for share in settings.preview]
         self.register_buffer("previewed", torch.tensor(previewed, dtype=torch.int64), persistent=False)
         self.register_buffer("frame", torch.arange(1, m + 1)[:, None].float(), persistent=False)
+        moving = [kind for kind in spec.particle_types if kind != KINEMATIC_TYPE] or [KINEMATIC_TYPE]  # a data set may hold kinematic particles alone
+        columns = [column for column, kind in enumerate(spec.particle_types) if kind in moving]
+        self.register_buffer("moving", torch.tensor(moving), persistent=False)
+        self.register_buffer("columns", torch.tensor(columns), persistent=False)
         self.fixed = KINEMATIC_TYPE in spec.particle_types
+        self.room: NodeRoom | None = None  # of occupied nodes, where steps are replayed
         self.context = 0 if spec.context_mean is None else len(spec.context_mean)
         if self.context:
             constant("context_mean", spec.context_mean)
             constant("context_std", np.maximum(spec.context_std or (), 1e-8))
-        materials = len(self.moving)
+        materials = len(moving)
         inputs = len(spec.particle_types) + materials * dim * (settings.history - 1) + 2 * dim + len(settings.preview) + self.context
         self.network = SparseUNet(dim, inputs, settings.channels, materials * (m * dim + 1), settings.blocks)
 
@@ -306,7 +344,10 @@ class GridEmulator(nn.Module):
         inside = ((fraction >= 0) & (fraction <= 1)).all(1)
         # CUDA has no products of integer matrices.
         node = (((base + 1) * self.grid.stride0).sum(1) + example * self.grid.sizes[0])[:, None] + self.corner_ids
-        weight = torch.where(self.corners.bool(), fraction[:, None], 1 - fraction[:, None]).prod(2)
+        factor = torch.where(self.corners.bool(), fraction[:, None], 1 - fraction[:, None])
+        weight = factor[:, :, 0]
+        for axis in range(1, factor.shape[2]):  # the gradient of ``prod`` waits for a GPU
+            weight = weight * factor[:, :, axis]
         return node, torch.where(inside[:, None], weight, 0)
 
     def to_grid(self, value: Tensor, row: Tensor, weight: Tensor, rows: int) -> Tensor:
@@ -337,18 +378,24 @@ class GridEmulator(nn.Module):
             (ahead - 1).clamp(-1, 3),
         ]
         if self.context:
-            parts.append(((context - self.context_mean) / self.context_std)[node // size])
+            given = (context - self.context_mean) / self.context_std
+            parts.append(given[(node // size).clamp(max=len(given) - 1)])
         return torch.cat(parts, 1)
 
-    def density(self, position: Tensor, example: Tensor, examples: int) -> Tensor:
+    def density(self, position: Tensor, example: Tensor, examples: int, counted: Tensor | None = None) -> Tensor:
         """[N, k]: density, 1 in the bulk, that particles see among themselves at k sets of places [k, N, d]: sum_i w_ip m sum_q w_iq."""
         sets = len(position)
         node, weight = self.weights(position.flatten(0, 1), (example + examples * torch.arange(sets, device=example.device)[:, None]).flatten())
+        if counted is not None:
+            weight = weight * counted.repeat(sets)[:, None]
         grid = weight.new_zeros(sets * examples * self.grid.sizes[0]).index_add(0, node.reshape(-1), weight.reshape(-1))
         return (grid.index_select(0, node.reshape(-1)).view_as(weight) * weight).sum(1).view(sets, position.shape[1]).t() * self.particle_mass
 
-    def call(self, history: Tensor, kind: Tensor, example: Tensor, examples: int, context: Tensor | None = None) -> Tensor:
-        """The next m positions [m, N, d] of a history [history, N, d]; context [examples, c]. Kinematic particles come out unprescribed."""
+    def call(
+        self, history: Tensor, kind: Tensor, example: Tensor, examples: int, context: Tensor | None = None, counted: Tensor | None = None
+    ) -> Tensor:
+        """The next m positions [m, N, d] of a history [history, N, d]; context [examples, c]. Kinematic particles come out unprescribed, particles
+        outside ``counted`` [N] (with ``room`` only, see ``Windows``) are seen by nobody."""
         dim, m = self.spec.dim, self.options.frames_per_call
         position = history[-1]
         velocity = (history[1:] - history[:-1]).flip(0).transpose(0, 1)
@@ -356,15 +403,17 @@ class GridEmulator(nn.Module):
         if self.options.walls:
             flight = torch.minimum(torch.maximum(flight, self.bounds[:, 0]), self.bounds[:, 1])
         node, weight = self.weights(position, example)
-        occupied, rows, levels = self.grid.occupy(node, examples)
+        if counted is not None:
+            node, weight = torch.where(counted[:, None], node, examples * self.grid.sizes[0]), weight * counted[:, None]
+        occupied, rows, levels = self.grid.occupy(node, examples, self.room)
         row = rows[node]
         one_hot, material = (kind[:, None] == self.types).to(position.dtype), (kind[:, None] == self.moving).to(position.dtype)
-        ahead = self.density(flight.index_select(1, self.previewed).transpose(0, 1), example, examples)
+        ahead = self.density(flight.index_select(1, self.previewed).transpose(0, 1), example, examples, counted)
         own = (material[:, :, None] * velocity.flatten(1)[:, None]).flatten(1)
         sums = self.to_grid(torch.cat([one_hot, own, ahead], 1), row, weight, len(occupied))
         mass, sums, ahead = sums.split((one_hot.shape[1], own.shape[1], ahead.shape[1]), 1)
         # Isolated particles leave nodes almost without mass: the constant keeps their gradients bounded.
-        mean = sums.view(len(mass), len(self.moving), -1) / (mass[:, torch.isin(self.types, self.moving), None] + 1e-3)
+        mean = sums.view(len(mass), len(self.moving), -1) / (mass.index_select(1, self.columns)[:, :, None] + 1e-3)
         ahead = ahead / (mass.sum(1, keepdim=True) + 1e-3)
         mean = mean.view(*mean.shape[:2], *velocity.shape[1:])
         output = self.network(self.node_features(occupied, mass * self.particle_mass, mean, ahead, context), levels)
@@ -377,6 +426,30 @@ class GridEmulator(nn.Module):
         return (flight + deviation.cumsum(1)).transpose(0, 1)
 
     # ---- training -------------------------------------------------------------------------------------------------------------------
+
+    @property
+    def replayable(self) -> bool:
+        """Whether training steps can be CUDA graphs (``learn.replay``): on a GPU."""
+        return self.bounds.device.type == "cuda"
+
+    def measure(self, windows: Windows) -> list[int]:
+        """Nodes of each level that ``windows`` occupy in the first call."""
+        position, device = windows.position[self.options.history - 1].to(self.bounds.device), self.bounds.device
+        node, _ = self.weights(position, windows.example.to(device))
+        return [len(level.neighbours) for level in self.grid.occupy(node, windows.examples)[2]]
+
+    def make_room(self, capacity: list[int], examples: int) -> NodeRoom:
+        """For steps on so many windows, which occupy at most ``capacity`` nodes of each level (``learn.replay``)."""
+        return NodeRoom(capacity, examples, self.bounds.device)
+
+    @contextmanager
+    def using(self, room: NodeRoom) -> Iterator[None]:
+        """One training step in ``room``."""
+        self.room = room
+        try:
+            yield
+        finally:
+            self.room = None
 
     def calls(self, progress: float) -> int:
         """Calls unrolled at this share of the training."""
@@ -393,34 +466,50 @@ class GridEmulator(nn.Module):
         e: the noise of the last input position, so that the targets move with the noisy start; scale_j: the rms deviation of the
         window's frame j of a call from ballistic flight, at least ``floor`` spacings (otherwise free flight would be all noise).
         """
-        history, m = self.options.history, self.options.frames_per_call
+        windows = self.pick(windows, generator)
+        return self.loss_under(self.noise(windows, generator), windows)
+
+    def pick(self, windows: Windows, generator: torch.Generator) -> Windows:
+        """The windows of a batch that are trained on (``select``)."""
         select = self.options.select
         if windows.place is not None:  # of its own windows a process selects its share, and judges them by their own deviations
             select = max(round(select * len(windows.example) / windows.place[1]), 1 if select else 0)
-        if 0 < select < windows.examples:
-            windows = self._select(windows, select, generator)
+        return self._select(windows, select, generator) if 0 < select < windows.examples else windows
+
+    def noise(self, windows: Windows, generator: torch.Generator) -> Tensor:
+        """Noise of the input of ``windows`` [history, N, d]."""
         moving = windows.particle_type != KINEMATIC_TYPE
-        noise = random_walk_noise(windows.position[:history], self.options.noise * self.velocity_std, generator, moving, windows.place)
+        sigma = self.options.noise * self.velocity_std.to(windows.position.device)
+        return random_walk_noise(windows.position[: self.options.history], sigma, generator, moving, windows.place)
+
+    def loss_under(self, noise: Tensor, windows: Windows) -> Tensor:
+        """``loss`` of all the windows with this noise."""
+        history, m, counted = self.options.history, self.options.frames_per_call, windows.counted
+        judged = moving = windows.particle_type != KINEMATIC_TYPE
+        if counted is not None:
+            judged = moving & counted
+        count = judged.sum() * self.spec.dim
         state = windows.position[:history] + noise
         target = windows.position[history:] + noise[-1]
-        scale = self._scale(windows.position, moving)
+        scale = self._scale(windows.position, judged, count)
+        examples = windows.examples if self.room is None else self.room.examples
         errors = []
         for first in range(0, len(target), m):
             context = None if windows.context is None else windows.context[history - 1 + first]
-            future = self.call(state, windows.particle_type, windows.example, windows.examples, context)
+            future = self.call(state, windows.particle_type, windows.example, examples, context, counted)
             truth = target[first : first + m]
             if self.fixed:
                 future = torch.where(moving[:, None], future, truth)
-            errors.append((future - truth)[:, moving].square().mean((1, 2)))
+            errors.append(torch.where(judged[:, None], future - truth, 0).square().sum((1, 2)) / count)
             state = torch.cat([state, future])[-history:]
         return (torch.cat(errors) / scale.square()).mean()
 
-    def _scale(self, position: Tensor, moving: Tensor) -> Tensor:
-        """[K m]: rms deviation of the window's frames after the history from ballistic flight, floored."""
+    def _scale(self, position: Tensor, judged: Tensor, count: Tensor) -> Tensor:
+        """[K m]: rms deviation of the window's frames after the history from ballistic flight, floored; ``count``: coordinates of ``judged`` [N]."""
         now = self.options.history - 1
         frame = torch.arange(1, len(position) - now, dtype=position.dtype, device=position.device)[:, None, None]
         flight = position[now] + (position[now] - position[now - 1]) * frame + self.gravity * frame * (frame + 1) / 2
-        deviation = (position[now + 1 :] - flight)[:, moving].square().mean((1, 2)).sqrt()
+        deviation = (torch.where(judged[:, None], position[now + 1 :] - flight, 0).square().sum((1, 2)) / count).sqrt()
         return deviation.clamp(min=self.options.floor * self.spec.spacing)
 
     def _select(self, windows: Windows, count: int, generator: torch.Generator) -> Windows:
@@ -429,7 +518,7 @@ class GridEmulator(nn.Module):
         A window in thirty holds the first touch of a wall, and nine tenths of the error of a batch: uniform sampling starves on it.
         """
         position = windows.position
-        change = position[2:] - 2 * position[1:-1] + position[:-2] - self.gravity
+        change = position[2:] - 2 * position[1:-1] + position[:-2] - self.gravity.to(position.device)
         energy = position.new_zeros(windows.examples).index_add(0, windows.example, change.square().sum((0, 2)))
         rms = (energy / torch.bincount(windows.example)).sqrt().cpu()
         chance = 0.5 / windows.examples + 0.5 * rms / rms.sum().clamp(min=1e-30)

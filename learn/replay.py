@@ -1,33 +1,27 @@
-"""Steps of a GNS as CUDA graphs: a rollout's, and a training's with its optimiser.
+"""Training steps as CUDA graphs.
 
-A step of a GNS is a few hundred small kernels, and to launch them takes a fast GPU longer than to run them. Captured once, over tensors that stay
+A step is some hundred small kernels, and to launch them takes a fast GPU longer than to run them. Captured once, over tensors that stay
 where they are, a step is one launch; nothing in it waits for the host. What differs from step to step (a batch, its noise, the learning
 rate) is copied into those tensors before; results are read when somebody wants to know them.
 
-Decisions: whole steps are captured, not parts, since every part has a search before it. Shapes are capacities (``learn.fused``): batches of fewer
-particles are filled up by rows that count for nothing, and a step whose edges exceed their capacity is no step, the capacity is raised. On a CPU
-(the tests') the same functions are called without a graph.
+Decisions: whole steps are captured, optimiser and average of the weights included, since every part has a search before it. Shapes are capacities:
+batches of fewer particles are filled up by rows that count for nothing, and a step whose edges (or occupied nodes) exceed their capacity is no step,
+the capacity is raised. On a CPU (the tests') the same functions are called without a graph.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from typing import Any, Protocol
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
 from learn.dataset import Windows
-from learn.fused import Search, Shadow
-from learn.graph import radius_graph
 
-if TYPE_CHECKING:
-    from learn.gns import GNS, _State
-
-#: Room for this many times the edges of the first batch of a training.
+#: Room for this many times what the first batch of a training has.
 ROOM = 1.25
 
 
@@ -60,85 +54,36 @@ class Replay:
         self.graph.replay()
 
 
-def _searching(model: GNS, bounds: np.ndarray, examples: int, capacity: int) -> Search:
-    return Search(bounds, model.radius, examples, capacity, model.options.self_edges, model.features.bounds.device)
+class Room(Protocol):
+    """What a model's step has room for.
+
+    capacity: numbers of edges, or of nodes of each level; most [same] int64: those of the fullest graph since it was zeroed.
+    """
+
+    capacity: list[int]
+    most: Tensor
 
 
-@contextmanager
-def _using(model: GNS, search: Search, shadow: Shadow) -> Iterator[None]:
-    # For one step, not for good: validation rolls out between two steps of a training, whose graph goes on reading its own shadow.
-    model.search, model.network.shadow = search, shadow
-    try:
-        yield
-    finally:
-        model.search = model.network.shadow = None
+class Replayable(Protocol):
+    """A model whose training steps can be captured."""
 
+    def pick(self, windows: Windows, generator: torch.Generator) -> Windows:
+        """The windows of a batch that the loss is of."""
 
-class RolloutReplay:
-    """Steps of the rollouts ``which`` together. ``compute`` predicts, ``accept`` makes that the present."""
+    def noise(self, windows: Windows, generator: torch.Generator) -> Tensor:
+        """Noise of their input [frames, N, d]."""
 
-    def __init__(self, model: GNS, which: list[int], states: Sequence[_State], bounds: Tensor):
-        self.model, self.which, self.states = model, which, [states[number] for number in which]
-        self.bounds, device = bounds, model.features.bounds.device
-        counts = [len(state.kinds) for state in self.states]
-        self.ends = np.cumsum([0, *counts])
-        self.last = torch.from_numpy(self.ends).to(device)
-        self.kinds = torch.cat([state.kinds for state in self.states])
-        self.example = torch.repeat_interleave(torch.arange(len(counts), device=device), torch.tensor(counts, device=device))
-        self.particles = torch.tensor([len(self.kinds)], dtype=torch.int32, device=device)
-        self.position = torch.cat([state.position for state in self.states], 1)
-        self.following = self.position.clone()
-        self.known = [state.known(model.spec.stride) for state in self.states]
-        self.context = None
-        if model.features.context:
-            self.context = torch.zeros(len(counts), len(self.states[0].context), device=device)
-        first = 0
-        for state in self.states:
-            edges = state.first_edges or radius_graph(state.position[-1], model.radius, None, model.options.self_edges).edges
-            first += state.measure(edges)
-        self.search = _searching(model, states[0].start.bounds, len(counts), math.ceil(model.options.edge_cap * first) + 1)
-        self.shadow = Shadow(model.network)
-        self.shadow.refresh()
-        self.replay = Replay(device)
+    def loss_under(self, noise: Tensor, windows: Windows) -> Tensor:
+        """The loss [], reading nothing on the host while there is ``room``."""
 
-    def _step(self) -> None:
-        model, position = self.model, self.position
-        with _using(model, self.search, self.shadow):
-            context = None if self.context is None else self.context[self.example]
-            graph = self.search(position[-1], self.example, self.particles)
-            output = model._predict(position, graph, self.kinds, self.bounds, context)
-            acceleration = model.features.acceleration(output, position, self.bounds)
-        frames = []
-        for state, known, a, b in zip(self.states, self.known, self.ends[:-1], self.ends[1:], strict=True):
-            own = position[:, a:b]
-            following = model.following(state, own, acceleration[a:b], known)
-            frames.append(model.between(state, own, acceleration[a:b], following, known))
-        self.frames = torch.cat(frames, 1)
-        self.following.copy_(torch.cat([position[1:], self.frames[-1:]]))
-        # Counted before they are cut off at the capacity: a clump must not look smaller than it is.
-        self.found = graph.found[self.last]
+    def measure(self, windows: Windows) -> list[int]:
+        """What ``windows`` take of the capacities."""
 
-    def compute(self) -> tuple[list[np.ndarray], list[int]]:
-        """The next frames [stride, particles, dim] of each, and the edges that each has."""
-        for state, known in zip(self.states, self.known, strict=True):
-            if known is not None:
-                known.copy_(state.known(self.model.spec.stride))
-        if self.context is not None:
-            self.context.copy_(torch.from_numpy(np.stack([state.context for state in self.states])))
-        self.replay(self._step)
-        frames, edges = self.frames.float().cpu().numpy(), np.diff(self.found.tolist()).tolist()
-        return [np.ascontiguousarray(frames[:, a:b]) for a, b in zip(self.ends[:-1], self.ends[1:], strict=True)], edges
+    def make_room(self, capacity: list[int], examples: int) -> Room:
+        """At least of these capacities, for batches of so many windows."""
 
-    def accept(self) -> None:
-        """Go on from the frames that ``compute`` returned."""
-        self.position.copy_(self.following)
-        for state in self.states:
-            state.present += self.model.spec.stride
-
-    def release(self) -> None:
-        """Hand the present back to the states, for another set of them."""
-        for state, a, b in zip(self.states, self.ends[:-1], self.ends[1:], strict=True):
-            state.position = self.position[:, a:b].clone()
+    def using(self, room: Room) -> AbstractContextManager[None]:
+        """One step, in ``room``."""
 
 
 class _Input:
@@ -158,37 +103,40 @@ class _Input:
 
 
 class TrainingReplay:
-    """Training steps on batches of at most ``rows`` particles: loss, gradient, clipping, Adam, the average of the weights.
+    """Training steps on batches like ``first``, of windows of at most ``largest`` particles.
 
-    A step whose loss or gradient is not finite, or whose edges exceed their capacity, changes nothing; ``settle`` tells.
+    A step is loss, gradient, clipping, optimiser and the average of the weights. One whose loss or gradient is not finite, or that has no room,
+    changes nothing; ``settle`` tells.
     """
 
-    def __init__(self, model: GNS, parameters: list[nn.Parameter], optimizer, average: dict[str, Tensor], clip: float, first: Windows, rows: int):
+    def __init__(self, model: Any, parameters: list[nn.Parameter], optimizer, average: dict[str, Tensor], clip: float, first: Windows, largest: int):
         self.model, self.parameters, self.optimizer, self.clip, self.average = model, parameters, optimizer, clip, average
-        # Rows in whole tiles, and in whole parts of sums.
-        self.device, self.rows, self.frames = model.features.bounds.device, -(-rows // 64) * 64, len(first.position)
+        self.device, self.frames = parameters[0].device, len(first.position)
+        # The real draws begin with the first step.
+        first = model.pick(first, torch.Generator())
         self.examples, (_, particles, dim) = first.examples, first.position.shape
-        graph = radius_graph(first.position[model.velocities], model.radius, first.example, model.options.self_edges)
-        edges = max(graph.edges, particles)  # without self edges there may be none at first
-        self.capacity, rows = math.ceil(ROOM * edges * rows / particles), self.rows
+        rows = self.examples * largest
+        self.capacity = [math.ceil(ROOM * count * rows / particles) for count in model.measure(first)]
+        self.rows = rows = -(-rows // 64) * 64  # in whole tiles, and in whole parts of sums
 
         def given(*shape: int, dtype: torch.dtype = torch.float32) -> _Input:
             return _Input(self.device, *shape, dtype=dtype)
 
-        self.position, self.noise = given(self.frames, rows, dim), given(model.velocities + 1, rows, dim)
+        noise = len(model.noise(first, torch.Generator()))
+        self.position, self.noise = given(self.frames, rows, dim), given(noise, rows, dim)
         self.kinds, self.example, self.counted = given(rows, dtype=torch.int64), given(rows, dtype=torch.int64), given(rows, dtype=torch.bool)
         self.context = None if first.context is None else given(*first.context.shape)
         self.numbers = given(3)  # learning rate, decay of the average, 1 where nothing is to change
-        # Losses, gradient norms, steps with a number that is not finite, steps without room; and the edges of the largest graph.
+        # Losses, gradient norms, steps with a number that is not finite, steps without room; and what the largest graph had.
         self.totals = torch.zeros(4, dtype=torch.float64, device=self.device)
-        self.most = torch.zeros((), dtype=torch.int64, device=self.device)
+        self.most = torch.zeros(len(self.capacity), dtype=torch.int64, device=self.device)
         self._copied = [torch.cuda.Event() for _ in range(2)] if self.device.type == "cuda" else None
         self._turn, self._still = 0, False
-        self.shadow = Shadow(model.network)
         self._begin()
 
     def _begin(self) -> None:
-        self.search = _searching(self.model, np.asarray(self.model.spec.bounds), self.examples, self.capacity)
+        self.room = self.model.make_room(self.capacity, self.examples)
+        self.limit = torch.tensor(self.room.capacity, device=self.device)
         self.replay = Replay(self.device)
 
     def _prepare(self) -> None:
@@ -202,9 +150,8 @@ class TrainingReplay:
 
     def _step(self) -> None:
         model = self.model
-        self.shadow.refresh()
-        self.search.most.zero_()  # of this step's graphs alone: the next ones may have room
-        with _using(model, self.search, self.shadow):
+        self.room.most.zero_()  # of this step's graphs alone: the next ones may have room
+        with model.using(self.room):
             context = None if self.context is None else self.context.value
             windows = Windows(self.position.value, self.kinds.value, self.example.value, context, counted=self.counted.value)
             for parameter in self.parameters:
@@ -212,12 +159,12 @@ class TrainingReplay:
             loss = model.loss_under(self.noise.value, windows)
             loss.backward()
         norm = nn.utils.clip_grad_norm_(self.parameters, self.clip)
-        room, finite = self.search.most <= self.search.capacity, loss.isfinite() & norm.isfinite()
+        room, finite = (self.room.most <= self.limit).all(), loss.isfinite() & norm.isfinite()
         rate, decay, still = self.numbers.value
         good = room & finite & (still == 0)
         parts = torch.where(good, loss.detach(), 0), torch.where(good, norm, 0), room & ~finite, ~room
         self.totals += torch.stack([part.double() for part in parts])
-        torch.maximum(self.most, self.search.most, out=self.most)
+        torch.maximum(self.most, self.room.most, out=self.most)
         self.optimizer.step(rate, found_inf=1 - good.float())
         own = model.state_dict()
         names = [name for name, value in own.items() if value.is_floating_point()]
@@ -229,6 +176,7 @@ class TrainingReplay:
 
     def step(self, windows: Windows, generator: torch.Generator, rate: float, decay: float) -> None:
         """One step on ``windows``, which are on the host, as is the generator of their noise; returns before the device has made it."""
+        windows = self.model.pick(windows, generator)
         turn, count = self._turn, windows.position.shape[1]
         self._turn = 1 - turn
         if self._copied:
@@ -251,7 +199,7 @@ class TrainingReplay:
         loss, norm, bad, full = self.totals.tolist()
         self.totals.zero_()
         if full:
-            self.capacity = math.ceil(ROOM * int(self.most))
+            self.capacity = [max(math.ceil(ROOM * most), old) for most, old in zip(self.most.tolist(), self.room.capacity, strict=True)]
             self._begin()
         self.most.zero_()
         return loss, norm, int(bad), int(full)

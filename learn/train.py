@@ -36,6 +36,7 @@ from learn.checkpoint import STATE_KEYS, build_model, load_state, load_weights, 
 from learn.dataset import Dataset, DataSettings, Sampler, Windows
 from learn.metrics import frame_mse, spacing_ratio
 from learn.parallel import Processes
+from learn.replay import TrainingReplay
 from learn.variants import with_variant
 from sim import __version__, periodic
 from sim.errors import InputError, RunError
@@ -212,17 +213,23 @@ class Muon:
         self.adam = Adam(others, weight_decay)
 
     @torch.no_grad()
-    def step(self, rate: float) -> None:
-        """One step at learning rate ``rate``; parameters without a gradient stay."""
+    def step(self, rate: float | Tensor, found_inf: Tensor | None = None) -> None:
+        """One step at learning rate ``rate``; parameters without a gradient stay, and all where ``found_inf`` [] is 1."""
         for momentum, (shape, group) in zip(self.momentum, self.groups.items(), strict=True):
             used = [k for k, parameter in enumerate(group) if parameter.grad is not None]
             if used:
                 gradient = torch.stack([group[k].grad.reshape(shape) for k in used])
-                momentum[used] = moved = momentum[used].lerp(gradient, 1 - self.MOMENTUM)
-                direction = self.orthogonal(gradient.lerp(moved, self.MOMENTUM))
-                for k, update in zip(used, direction.mul_(0.2 * math.sqrt(max(shape)) * rate), strict=True):
-                    group[k].mul_(1 - rate * self.weight_decay).sub_(update.view_as(group[k]))
-        self.adam.step(rate)
+                rows = slice(None) if len(used) == len(group) else used  # a list of numbers has to be brought to a GPU
+                before, decay = momentum[rows], rate * self.weight_decay
+                moved = before.lerp(gradient, 1 - self.MOMENTUM)
+                updates = self.orthogonal(gradient.lerp(moved, self.MOMENTUM)).mul_(0.2 * math.sqrt(max(shape)) * rate)
+                if found_inf is not None:
+                    good = found_inf == 0
+                    moved, updates, decay = torch.where(good, moved, before), torch.where(good, updates, 0), torch.where(good, decay, 0)
+                momentum[rows] = moved
+                for k, update in zip(used, updates, strict=True):
+                    group[k].mul_(1 - decay).sub_(update.view_as(group[k]))
+        self.adam.step(rate, found_inf)
 
     def orthogonal(self, x: Tensor) -> Tensor:
         """[n, rows, columns] with the singular vectors of ``x`` and singular values near 1 (0.6 to 1.2; tiny ones stay smaller)."""
@@ -324,9 +331,9 @@ class Trainer:
         self._seconds_before = self.progress_state["seconds"]
         self._stop: str | None = None
         self._rolling = False
-        alone = self.processes.size == 1 and self.settings.edges is None and self.settings.optimizer == "adam"
+        alone = self.processes.size == 1 and self.settings.edges is None
         self.replayed = alone and getattr(self.model, "replayable", False)
-        self._replay: Any = None  # ``learn.replay.TrainingReplay``, by the model: who trains a grid emulator does not depend on it
+        self._replay: TrainingReplay | None = None
 
     # -- set-up --------------------------------------------------------------------------------------------------------------
 
@@ -499,9 +506,9 @@ class Trainer:
             if self._replay is None or self._replay.frames != frames:
                 self._settle()
                 self._replay = None  # before the next one takes as much memory
-                rows = self.settings.batch * max(shape[1] for shape in self.train_data.shapes)
+                largest = max(shape[1] for shape in self.train_data.shapes)
                 clip = self.settings.gradient_clip or math.inf
-                self._replay = self.model.training_replay(self.parameters, self.optimizer, self.average, clip, windows, rows)
+                self._replay = TrainingReplay(self.model, self.parameters, self.optimizer, self.average, clip, windows, largest)
             self._replay.step(windows, self.generator, rate, self._decay())
         else:
             self._step(windows.to(self.device), rate, progress)
@@ -555,7 +562,7 @@ class Trainer:
             self._diverged(f"{bad} steps with a loss or a gradient that is not finite")
         if full:
             self.progress_state["logged"] -= full
-            self._say(f"step {self.step}: {full} steps had more edges than there was room for and were skipped; there is more room now")
+            self._say(f"step {self.step}: {full} steps had larger graphs than there was room for and were skipped; there is more room now")
 
     def _join(self, loss: float, windows: Windows) -> float:
         """The loss and, in place, the gradient of the whole batch: those of the processes, weighted by the particles they are means over."""

@@ -1,6 +1,6 @@
 """Training, validation, resuming and rollouts on a device, where there is none: on one that is made up (``other_device``), with the CPU's numbers.
 
-Kernels and replayed steps, which take a GPU, are those of ``test_fused.py`` and ``benchmarks/gns_cuda.py``.
+Kernels and replayed steps, which take a GPU, are those of ``test_fused.py``, ``test_replay.py`` and ``benchmarks/gns_cuda.py``, ``grid_cuda.py``.
 """
 
 import csv
@@ -15,6 +15,7 @@ from other_device import OtherDevice
 
 from learn.checkpoint import load_model
 from learn.dataset import Dataset, DataSettings
+from learn.grid_emulator import GridEmulator
 from learn.train import Config, Trainer, TrainSettings, train
 from sim.simulator import rollout, start_from
 
@@ -31,6 +32,7 @@ def device(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "get_rng_state", lambda device: torch.get_rng_state())
     monkeypatch.setattr(torch.cuda, "set_rng_state", lambda state, device: torch.set_rng_state(state))
+    monkeypatch.setattr(GridEmulator, "replayable", False)  # it has no graphs
     return OtherDevice()
 
 

@@ -19,9 +19,10 @@ from textbook_gns import TextbookNetwork
 from learn import fused
 from learn.dataset import DataSpec, Windows
 from learn.gns import GNSSettings, Network
+from learn.gns_replay import RolloutReplay
 from learn.graph import Graph, radius_graph
 from learn.model import build
-from learn.replay import RolloutReplay, TrainingReplay
+from learn.replay import TrainingReplay
 from learn.train import Adam
 from sim.simulator import SimulationError, Start, rollout, rollouts
 
@@ -139,7 +140,7 @@ def test_replayed_training_is_training(changes, settings, kinds, context):
     for model, fast in ((plain, False), (replayed, True)):
         parameters, generator = list(model.parameters()), torch.Generator().manual_seed(7)
         optimizer, average = Adam(parameters, 0.0), {name: value.clone() for name, value in model.state_dict().items()}
-        replay = TrainingReplay(model, parameters, optimizer, average, 1.0, batches[0], 20) if fast else None
+        replay = TrainingReplay(model, parameters, optimizer, average, 1.0, batches[0], 10) if fast else None
         losses = norms = 0.0
         for step, windows in enumerate(batches):
             if replay:
@@ -168,7 +169,7 @@ def test_a_batch_without_edges_trains():
     model = build("gns", SETTINGS | {"self_edges": False}, spec_of(radius=1e-4))
     parameters, apart = list(model.parameters()), batch(4, (8, 8), 0)
     wanted = model.loss(apart, torch.Generator().manual_seed(7), 0.0).item()
-    replay = TrainingReplay(model, parameters, Adam(parameters, 0.0), model.state_dict(), 1.0, apart, 16)
+    replay = TrainingReplay(model, parameters, Adam(parameters, 0.0), model.state_dict(), 1.0, apart, 8)
     replay.step(apart, torch.Generator().manual_seed(7), 1e-2, 0.5)
     loss, _, *none = replay.settle()
     assert none == [0, 0] and loss == pytest.approx(wanted, rel=1e-4)
@@ -180,17 +181,17 @@ def test_a_step_that_is_none_changes_nothing_and_is_told():
     optimizer, average = Adam(parameters, 0.0), {name: value.clone() for name, value in model.state_dict().items()}
     good, bad = batch(4, (8, 8), 0), batch(4, (8, 8), 1)
     bad.position[-1, 3] = torch.nan
-    replay = TrainingReplay(model, parameters, optimizer, average, 1.0, good, 16)
+    replay = TrainingReplay(model, parameters, optimizer, average, 1.0, good, 8)
     before = copy.deepcopy(model.state_dict())
     replay.step(bad, torch.Generator(), 1e-2, 0.5)
     assert replay.settle()[2:] == (1, 0)
-    dense, capacity = batch(4, (8, 8), 0), replay.search.capacity
+    dense, capacity = batch(4, (8, 8), 0), replay.room.search.capacity
     dense.position[:] = 0.5
     dense.example[:] = 0  # 256 edges
     assert capacity < 256
     replay.step(dense, torch.Generator(), 1e-2, 0.5)
     replay.step(bad, torch.Generator(), 1e-2, 0.5)
-    assert replay.settle()[2:] == (1, 1) and replay.search.capacity > 256
+    assert replay.settle()[2:] == (1, 1) and replay.room.search.capacity > 256
     for name, value in model.state_dict().items():
         assert torch.equal(value, before[name]) and torch.equal(average[name], before[name])
     assert all(int(step) == 0 for step in optimizer.steps)
@@ -201,7 +202,7 @@ def test_a_step_that_is_none_changes_nothing_and_is_told():
 def test_a_dense_batch_costs_its_own_step_alone():
     model = build("gns", SETTINGS, spec_of())
     parameters, good = list(model.parameters()), batch(4, (8, 8), 0)
-    replay = TrainingReplay(model, parameters, Adam(parameters, 0.0), model.state_dict(), 1.0, good, 16)
+    replay = TrainingReplay(model, parameters, Adam(parameters, 0.0), model.state_dict(), 1.0, good, 8)
     dense = batch(4, (8, 8), 0)
     dense.position[:], dense.example[:] = 0.5, 0
     for windows in (dense, good, good):
@@ -256,7 +257,7 @@ def test_rollouts_between_training_steps_leave_them_alone(replaying):
         model = copy.deepcopy(first)
         parameters, generator = list(model.parameters()), torch.Generator().manual_seed(7)
         average = {name: value.clone() for name, value in model.state_dict().items()}
-        replay = TrainingReplay(model, parameters, Adam(parameters, 0.0), average, 1.0, good, 16)
+        replay = TrainingReplay(model, parameters, Adam(parameters, 0.0), average, 1.0, good, 8)
         for _ in range(2):
             replay.step(good, generator, 1e-2, 0.5)
             if validated:
@@ -271,7 +272,7 @@ def test_what_replays_is_freed_with_its_last_user(replaying):
     """Without the garbage collector: on a GPU it holds a graph's memory, and a validation makes several."""
     model = build("gns", SETTINGS, spec_of())
     parameters, good = list(model.parameters()), batch(4, (8, 8), 0)
-    training = TrainingReplay(model, parameters, Adam(parameters, 0.0), model.state_dict(), 1.0, good, 16)
+    training = TrainingReplay(model, parameters, Adam(parameters, 0.0), model.state_dict(), 1.0, good, 8)
     gc.collect()
     gc.disable()
     try:

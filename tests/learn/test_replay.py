@@ -1,0 +1,185 @@
+"""Captured training steps of a grid emulator (``learn.replay``), without a graph: beside plain steps, out of room, and that nothing in
+them waits for a device.
+
+Those of a GNS are in ``test_fused.py``; the graphs themselves take a GPU (``benchmarks/grid_cuda.py``).
+"""
+
+import copy
+
+import numpy as np
+import pytest
+import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from learn.dataset import DataSpec, Windows
+from learn.grid_emulator import NodeRoom, SparseGrid
+from learn.model import build
+from learn.replay import TrainingReplay
+from learn.train import OPTIMIZERS
+
+SETTINGS = {"channels": [16, 16], "frames_per_call": 3, "unroll": [2], "noise": 0.1}
+#: Water and sand beside kinematic particles, under a context; and in 3D.
+CASES = {
+    "one material": ({}, {}, (5,)),
+    "all": ({"particle_types": (3, 5, 6), "context_mean": (0.1,), "context_std": (1.0,)}, {"preview": []}, (3, 5, 6, 5)),
+    "3D": (
+        {"dim": 3, "bounds": ((0, 1),) * 3, "gravity": (0, 0, -1e-3)}
+        | {"velocity_mean": (0,) * 3, "velocity_std": (0.02,) * 3, "acceleration_mean": (0,) * 3, "acceleration_std": (0.004,) * 3},
+        {},
+        (5,),
+    ),
+    "selected": ({}, {"select": 2}, (5,)),
+}
+
+
+def spec_of(**changes) -> DataSpec:
+    content = dict(
+        dim=2, bounds=((0, 1), (0, 1)), radius=0.3, spacing=0.1, frame_step=0.01, stride=1, gravity=(0, -1e-3), particle_types=(5,),
+        velocity_mean=(0, 0), velocity_std=(0.02, 0.02), acceleration_mean=(0, 0), acceleration_std=(0.004, 0.004),
+    )  # fmt: skip
+    return DataSpec(**content | changes)
+
+
+def batch(frames: int, counts: tuple[int, ...], seed: int, dim: int = 2, kinds: tuple[int, ...] = (5,), context: int = 0) -> Windows:
+    generator, total = torch.Generator().manual_seed(seed), sum(counts)
+    steps = torch.randn((frames, total, dim), generator=generator).cumsum(0) * 0.003
+    position = torch.rand((total, dim), generator=generator) * 0.9 + 0.05 + steps
+    position[:, 0] = 2.0  # beyond the margin: on the grid nowhere
+    values = torch.randn((frames, len(counts), context), generator=generator) if context else None
+    kind = torch.tensor(kinds)[torch.arange(total) % len(kinds)]
+    return Windows(position.float(), kind, torch.repeat_interleave(torch.arange(len(counts)), torch.tensor(counts)), values)
+
+
+def test_packing_by_hand():
+    """Six ids, three rows of room: nodes 1, 3, 4 get them, in a second mask the fourth of four does not."""
+    room = NodeRoom([3], 1, torch.device("cpu"))
+    active, row = room.pack(0, torch.tensor([False, True, False, True, True, False]))
+    assert active.tolist() == [1, 3, 4, 6] and row.tolist() == [4, 0, 4, 1, 2, 4, 3] and room.most.tolist() == [3]
+    active, row = room.pack(0, torch.tensor([True, True, False, True, True, False]))
+    assert active.tolist() == [0, 1, 3, 6] and row.tolist() == [0, 1, 4, 2, 3, 4, 3] and room.most.tolist() == [4]
+
+
+def test_tables_of_a_fixed_length_are_the_tables():
+    grid = SparseGrid([7, 5], 2)
+    inner = (torch.arange(1, 8)[:, None] * grid.stride0[0] + torch.arange(1, 6)).flatten()
+    nodes = torch.cat([inner[torch.tensor([0, 3, 3, 18, 34])], inner[[7, 8]] + grid.sizes[0]])
+    finest, rows, levels = grid.occupy(nodes, 2)
+    room = NodeRoom([9, 6], 2, torch.device("cpu"))
+    active, places, padded = grid.occupy(torch.cat([nodes, torch.tensor([2 * grid.sizes[0]])]), 2, room)
+    counts = [len(level.neighbours) for level in levels]
+    assert room.most.tolist() == counts and active[: counts[0]].tolist() == finest.tolist()
+    assert set(active[counts[0] :].tolist()) == {2 * grid.sizes[0]}
+    assert torch.equal(places[nodes], rows[nodes])
+    for count, plain, full in zip(counts, levels, padded, strict=True):
+        empty = torch.where(plain.neighbours == count, len(full.neighbours), plain.neighbours)
+        assert torch.equal(full.neighbours[:count], empty)
+    assert torch.equal(padded[0].child[: counts[0]], levels[0].child) and padded[0].coarse == 7
+
+
+@pytest.mark.parametrize("optimizer", OPTIMIZERS)
+@pytest.mark.parametrize("case", CASES)
+def test_replayed_training_is_training(case, optimizer):
+    """Three steps on batches of different sizes: the same losses, weights and averages as plain steps."""
+    changes, settings, kinds = CASES[case]
+    torch.manual_seed(0)
+    plain = build("grid_emulator", SETTINGS | settings, spec_of(**changes))
+    torch.nn.init.normal_(plain.network.leave.weight, std=0.05)
+    replayed, found = copy.deepcopy(plain), []
+    batches = [
+        batch(plain.window(0.0), counts, seed, plain.spec.dim, kinds, int("context_mean" in changes))
+        for seed, counts in enumerate([(18, 19, 14), (20, 20, 20), (14, 17, 2)])
+    ]
+    for model, fast in ((plain, False), (replayed, True)):
+        parameters, generator = list(model.parameters()), torch.Generator().manual_seed(7)
+        steps, average = OPTIMIZERS[optimizer](parameters, 0.1), {name: value.clone() for name, value in model.state_dict().items()}
+        replay = TrainingReplay(model, parameters, steps, average, 1.0, batches[0], 20) if fast else None
+        losses = norms = 0.0
+        for step, windows in enumerate(batches):
+            if replay:
+                replay.step(windows, generator, 1e-2 / (step + 1), 0.5)
+                continue
+            for parameter in parameters:
+                parameter.grad = None
+            loss = model.loss(windows, generator, 0.0)
+            loss.backward()
+            losses, norms = losses + loss.item(), norms + torch.nn.utils.clip_grad_norm_(parameters, 1.0).item()
+            steps.step(1e-2 / (step + 1))
+            for name, value in model.state_dict().items():
+                average[name].lerp_(value, 0.5)
+        if replay:
+            losses, norms, *none = replay.settle()
+            assert none == [0, 0] and model.room is None
+        found.append((losses, norms, model.state_dict(), average))
+    (losses, norms, weights, average), (fast_losses, fast_norms, fast_weights, fast_average) = found
+    assert losses > 1e-3 and fast_losses == pytest.approx(losses, rel=1e-5) and fast_norms == pytest.approx(norms, rel=1e-4)
+    for name in weights:
+        torch.testing.assert_close(fast_weights[name], weights[name], rtol=1e-3, atol=2e-5)
+        torch.testing.assert_close(fast_average[name], average[name], rtol=1e-3, atol=2e-5)
+
+
+@pytest.mark.parametrize("optimizer", OPTIMIZERS)
+def test_a_step_that_is_none_changes_nothing_and_is_told(optimizer):
+    model = build("grid_emulator", SETTINGS, spec_of())
+    parameters = list(model.parameters())
+    steps, average = OPTIMIZERS[optimizer](parameters, 0.1), {name: value.clone() for name, value in model.state_dict().items()}
+    frames = model.window(0.0)
+    good = batch(frames, (18, 18), 0)
+    good.position.mul_(0.1)  # in a corner: few nodes
+    bad = copy.deepcopy(good)
+    bad.position[-1, 3] = torch.nan
+    replay = TrainingReplay(model, parameters, steps, average, 1.0, good, 18)
+    replay.step(good, torch.Generator().manual_seed(0), 1e-2, 0.5)
+    assert replay.settle()[2:] == (0, 0)
+    before, averaged = copy.deepcopy(model.state_dict()), copy.deepcopy(average)
+    replay.step(bad, torch.Generator().manual_seed(0), 1e-2, 0.5)
+    assert replay.settle()[2:] == (1, 0)
+    wide, capacity = batch(frames, (18, 18), 3), replay.room.capacity[0]
+    wide.position[:] = torch.from_numpy(np.stack(np.meshgrid(np.linspace(0, 1, 6), np.linspace(0, 1, 6)), -1).reshape(-1, 2)).float()
+    replay.step(wide, torch.Generator().manual_seed(0), 1e-2, 0.5)
+    replay.step(bad, torch.Generator().manual_seed(0), 1e-2, 0.5)
+    assert replay.settle()[2:] == (1, 1) and replay.room.capacity[0] > capacity
+    for name, value in model.state_dict().items():
+        assert torch.equal(value, before[name]) and torch.equal(average[name], averaged[name])
+    replay.step(good, torch.Generator().manual_seed(0), 1e-2, 0.5)
+    assert replay.settle()[2:] == (0, 0) and not torch.equal(next(model.parameters()), next(iter(before.values())))
+
+
+class Capturing(TorchDispatchMode):
+    """Refuses what the capture of a CUDA graph refuses: results that the host waits for, or that a shape depends on, tensors made of the host's
+    numbers, and ``prod``, whose gradient counts zeros on the host (not under a mode like this one)."""
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        name = func._schema.name
+        indexing = name in ("aten::index", "aten::index_put", "aten::index_put_")
+        masks = indexing and any(index is not None and index.dtype == torch.bool for index in args[1])
+        waits = ("aten::_local_scalar_dense", "aten::nonzero", "aten::masked_select", "aten::lift_fresh", "aten::prod", "aten::_unique2")
+        if masks or name in waits:
+            raise AssertionError(f"{name} in a captured step")
+        return func(*args, **(kwargs or {}))
+
+
+def test_what_a_capture_refuses_is_refused():
+    values = torch.ones(3)
+    forbidden = [lambda: values.sum().item(), lambda: values[values > 0], lambda: torch.tensor([1.0]), lambda: values.prod(), values.nonzero]
+    for action in forbidden:
+        with pytest.raises(AssertionError, match="captured"), Capturing():
+            action()
+
+
+@pytest.mark.parametrize("optimizer", OPTIMIZERS)
+@pytest.mark.parametrize("case", CASES)
+def test_nothing_in_a_step_waits_for_the_device(case, optimizer):
+    changes, settings, kinds = CASES[case]
+    model = build("grid_emulator", SETTINGS | settings, spec_of(**changes))
+    parameters, first = list(model.parameters()), batch(model.window(0.0), (18, 19, 14), 0, model.spec.dim, kinds, int("context_mean" in changes))
+    replay = TrainingReplay(model, parameters, OPTIMIZERS[optimizer](parameters, 0.1), model.state_dict(), 1.0, first, 20)
+    captured, step = [], replay._step
+
+    def capture():
+        with Capturing():
+            step()
+        captured.append(True)
+
+    replay._step = capture
+    replay.step(first, torch.Generator().manual_seed(0), 1e-2, 0.5)
+    assert captured and replay.settle()[2:] == (0, 0)
