@@ -517,18 +517,24 @@ class GridEmulator(nn.Module):
 
         A window in thirty holds the first touch of a wall, and nine tenths of the error of a batch: uniform sampling starves on it.
         """
-        position = windows.position
-        change = position[2:] - 2 * position[1:-1] + position[:-2] - self.gravity.to(position.device)
-        energy = position.new_zeros(windows.examples).index_add(0, windows.example, change.square().sum((0, 2)))
-        rms = (energy / torch.bincount(windows.example)).sqrt().cpu()
+        position, gravity = windows.position, self.gravity.to(windows.position.device)
+        ends = torch.bincount(windows.example).cumsum(0).tolist()
+        parts = [slice(first, last) for first, last in zip([0, *ends[:-1]], ends, strict=True)]
+        energy = []
+        for part in parts:  # one by one: small enough for a core's cache, which is four times as fast
+            own = position[:, part]
+            energy.append((own[2:] - 2 * own[1:-1] + own[:-2] - gravity).square().sum() / own.shape[1])
+        rms = torch.stack(energy).sqrt().cpu()
         chance = 0.5 / windows.examples + 0.5 * rms / rms.sum().clamp(min=1e-30)
-        chosen = torch.multinomial(chance, count, generator=generator).sort().values.to(position.device)
-        rank = torch.full((windows.examples,), -1, device=position.device)
-        rank[chosen] = torch.arange(len(chosen), device=position.device)
-        example = rank[windows.example]
-        keep = example >= 0
-        context = None if windows.context is None else windows.context[:, chosen]
-        return Windows(position[:, keep], windows.particle_type[keep], example[keep], context)
+        chosen = torch.multinomial(chance, count, generator=generator).sort().values.tolist()
+        kept = [parts[number] for number in chosen]
+        counts = torch.tensor([part.stop - part.start for part in kept], device=position.device)
+        return Windows(
+            torch.cat([position[:, part] for part in kept], 1),
+            torch.cat([windows.particle_type[part] for part in kept]),
+            torch.repeat_interleave(torch.arange(count, device=position.device), counts),
+            None if windows.context is None else windows.context[:, chosen],
+        )
 
     # ---- simulation -----------------------------------------------------------------------------------------------------------------
 
