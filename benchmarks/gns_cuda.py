@@ -2,7 +2,8 @@
 
 The textbook form (``tests/learn/textbook_gns.py``) runs in float32 with TF32 off and under bf16 autocast, on a graph that scipy makes on the host
 (``search_on_host_ms``, part of its time; the most used port searches on the device, so subtract it to compare networks). Ours is
-``learn.replay``: search, network, update (rollout), loss, gradient, clipping, Adam and the average of weights (training) in one CUDA graph.
+``learn.replay`` and ``learn.gns_replay``: search, network, update (rollout), loss, gradient, clipping, Adam and the average of weights (training)
+in one CUDA graph.
 Wall times of whole steps: of rollouts medians, each step with its frame handed to the host; of training means of steps that nobody waits
 for until the last. Noise is drawn on the host in both. Errors are relative, 2-norm, against the textbook form in float64 on the same graph.
 The roofline share is the floating-point operations of the network's products, counted, over the time and over what an 8192^3 bf16 product

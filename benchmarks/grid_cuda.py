@@ -2,8 +2,8 @@
 
 DATA: a data set of ``configs/scenes/sand.yaml`` (``sluice-sim generate configs/scenes/sand.yaml --split train --count 8 --out DATA``, and
 ``--split valid``). Steps as ``learn.train`` makes them: drawing the batch, selecting windows, noise, loss, gradient, clipping, optimiser and
-the average of the weights. Means of steps that nobody waits for until the last, both forms in turns, medians of the rounds; ``host``: drawing and selecting alone. The sums of
-the losses of the first steps of both forms, from the same weights and draws, are beside them.
+the average of the weights. Means of steps that nobody waits for until the last, both forms in turns, medians of the rounds; ``host``: drawing and
+selecting alone. The sums of the losses of the first ten steps of both forms, from the same weights and draws, are beside them.
 """
 
 from __future__ import annotations

@@ -191,7 +191,7 @@ class SparseGrid(nn.Module):
         if math.prod(shape) > MOST_NODES:
             raise MemoryError(f"a grid of {' x '.join(map(str, shape))} nodes; enlarge cell, or lessen margin")
         self.dim, self.sizes = dim, []
-        self.shape = list(shape)
+        self.shape, self.shapes = list(shape), []
         for level in range(levels):
             padded = torch.tensor(shape) + 2
             strides = torch.tensor([int(padded[a + 1 :].prod()) for a in range(dim)])
@@ -199,6 +199,7 @@ class SparseGrid(nn.Module):
             self.register_buffer(f"offset{level}", offsets @ strides, persistent=False)
             self.register_buffer(f"stride{level}", strides, persistent=False)
             self.sizes.append(int(padded.prod()))
+            self.shapes.append(list(shape))
             shape = [(extent + 1) // 2 for extent in shape]
             # Parent and corner of every node; the ring has none and is never occupied.
             coordinate = torch.stack(torch.meshgrid(*[torch.arange(-1, int(p) - 1) for p in padded], indexing="ij"), -1).reshape(-1, dim)
@@ -215,6 +216,7 @@ class SparseGrid(nn.Module):
         ``NodeRoom``, and ``nodes`` may hold its "nowhere", ``examples * sizes[0]``.
         """
         ids, corner = nodes.reshape(-1), None
+        every = ids  # those without room as well: a coarser level counts them
         levels: list[Level] = []
         for level, size in enumerate(self.sizes):
             total = examples * size
@@ -226,7 +228,7 @@ class SparseGrid(nn.Module):
                 lookup[active] = torch.arange(len(active), device=ids.device)
                 around = active[:, None] + getattr(self, f"offset{level}")
             else:
-                mask = torch.zeros(total + 1, dtype=torch.bool, device=ids.device).index_fill_(0, ids, True)
+                mask = torch.zeros(total + 1, dtype=torch.bool, device=ids.device).index_fill_(0, every, True)
                 active, lookup = room.pack(level, mask[:-1])
                 around = (active[:, None] + getattr(self, f"offset{level}")).clamp(max=total)
             if levels:
@@ -235,9 +237,13 @@ class SparseGrid(nn.Module):
                 finest, rows = active, lookup
             levels.append(Level(lookup[around]))
             if level + 1 < len(self.sizes):
-                example, local = active // size, active % size
-                ids, corner = getattr(self, f"parent{level}")[local] + example * self.sizes[level + 1], getattr(self, f"corner{level}")[local]
+                ids, corner = self._parents(level, active), getattr(self, f"corner{level}")[active % size]
+                every = ids if room is None else self._parents(level, every)
         return finest, rows, levels
+
+    def _parents(self, level: int, ids: Tensor) -> Tensor:
+        size = self.sizes[level]
+        return getattr(self, f"parent{level}")[ids % size] + ids // size * self.sizes[level + 1]
 
 
 class SparseUNet(nn.Module):
@@ -308,7 +314,6 @@ class GridEmulator(nn.Module):
         # Isotropic scales: a mirrored or turned scene has the same features.
         constant("velocity_scale", max(float(np.sqrt(np.mean(np.square(spec.velocity_std)))), 1e-12))
         constant("acceleration_scale", max(float(np.sqrt(np.mean(np.square(spec.acceleration_std)))), 1e-12))
-        constant("velocity_std", spec.velocity_std)
         # Deviations from flight grow like a random walk of accelerations.
         constant("frame_scale", torch.arange(1, m + 1).float().sqrt() * self.acceleration_scale)
         # One particle per cell of its own: density 1 in the bulk.
@@ -439,8 +444,9 @@ class GridEmulator(nn.Module):
         return [len(level.neighbours) for level in self.grid.occupy(node, windows.examples)[2]]
 
     def make_room(self, capacity: list[int], examples: int) -> NodeRoom:
-        """For steps on so many windows, which occupy at most ``capacity`` nodes of each level (``learn.replay``)."""
-        return NodeRoom(capacity, examples, self.bounds.device)
+        """For steps on so many windows, which occupy at most ``capacity`` nodes of each level, or all there are (``learn.replay``)."""
+        inner = [examples * math.prod(shape) for shape in self.grid.shapes]
+        return NodeRoom([min(count, most) for count, most in zip(capacity, inner, strict=True)], examples, self.bounds.device)
 
     @contextmanager
     def using(self, room: NodeRoom) -> Iterator[None]:
@@ -479,7 +485,7 @@ class GridEmulator(nn.Module):
     def noise(self, windows: Windows, generator: torch.Generator) -> Tensor:
         """Noise of the input of ``windows`` [history, N, d]."""
         moving = windows.particle_type != KINEMATIC_TYPE
-        sigma = self.options.noise * self.velocity_std.to(windows.position.device)
+        sigma = self.options.noise * torch.tensor(self.spec.velocity_std, dtype=torch.float32, device=windows.position.device)
         return random_walk_noise(windows.position[: self.options.history], sigma, generator, moving, windows.place)
 
     def loss_under(self, noise: Tensor, windows: Windows) -> Tensor:
@@ -517,7 +523,9 @@ class GridEmulator(nn.Module):
 
         A window in thirty holds the first touch of a wall, and nine tenths of the error of a batch: uniform sampling starves on it.
         """
-        position, gravity = windows.position, self.gravity.to(windows.position.device)
+        step = self.spec.frame_step * self.spec.stride
+        position = windows.position
+        gravity = torch.tensor(self.spec.gravity, dtype=torch.float32, device=position.device) * step * step
         ends = torch.bincount(windows.example).cumsum(0).tolist()
         parts = [slice(first, last) for first, last in zip([0, *ends[:-1]], ends, strict=True)]
         energy = []

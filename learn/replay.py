@@ -57,7 +57,7 @@ class Replay:
 class Room(Protocol):
     """What a model's step has room for.
 
-    capacity: numbers of edges, or of nodes of each level; most [same] int64: those of the fullest graph since it was zeroed.
+    capacity: numbers of edges, or of nodes of each level; most [of ``capacity``'s length] int64: those of the fullest graph since it was zeroed.
     """
 
     capacity: list[int]
@@ -66,6 +66,9 @@ class Room(Protocol):
 
 class Replayable(Protocol):
     """A model whose training steps can be captured."""
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """As of ``torch.nn.Module``."""
 
     def pick(self, windows: Windows, generator: torch.Generator) -> Windows:
         """The windows of a batch that the loss is of."""
@@ -109,7 +112,9 @@ class TrainingReplay:
     changes nothing; ``settle`` tells.
     """
 
-    def __init__(self, model: Any, parameters: list[nn.Parameter], optimizer, average: dict[str, Tensor], clip: float, first: Windows, largest: int):
+    def __init__(
+        self, model: Replayable, parameters: list[nn.Parameter], optimizer, average: dict[str, Tensor], clip: float, first: Windows, largest: int
+    ):
         self.model, self.parameters, self.optimizer, self.clip, self.average = model, parameters, optimizer, clip, average
         self.device, self.frames = parameters[0].device, len(first.position)
         # The real draws begin with the first step.

@@ -23,7 +23,7 @@ from learn.gns_replay import RolloutReplay
 from learn.graph import Graph, radius_graph
 from learn.model import build
 from learn.replay import TrainingReplay
-from learn.train import Adam
+from learn.train import OPTIMIZERS, Adam
 from sim.simulator import SimulationError, Start, rollout, rollouts
 
 
@@ -126,11 +126,12 @@ def batch(frames: int, counts: tuple[int, ...], seed: int, kinds: tuple[int, ...
     )
 
 
+@pytest.mark.parametrize("optimizer", OPTIMIZERS)
 @pytest.mark.parametrize(
     ("changes", "settings", "kinds", "context"),
     [({}, {}, (5,), 0), ({"particle_types": (3, 5), "context_mean": (0.1,), "context_std": (1.0,)}, {"unroll": (2,)}, (3, 5), 1)],
 )
-def test_replayed_training_is_training(changes, settings, kinds, context):
+def test_replayed_training_is_training(changes, settings, kinds, context, optimizer):
     """Three steps on batches of different sizes: the same losses, weights and averages as plain steps."""
     torch.manual_seed(0)
     plain = build("gns", SETTINGS | settings, spec_of(**changes))
@@ -139,8 +140,8 @@ def test_replayed_training_is_training(changes, settings, kinds, context):
     batches = [batch(frames, counts, seed, kinds, context) for seed, counts in enumerate([(8, 9), (10, 10), (4, 7)])]
     for model, fast in ((plain, False), (replayed, True)):
         parameters, generator = list(model.parameters()), torch.Generator().manual_seed(7)
-        optimizer, average = Adam(parameters, 0.0), {name: value.clone() for name, value in model.state_dict().items()}
-        replay = TrainingReplay(model, parameters, optimizer, average, 1.0, batches[0], 10) if fast else None
+        rule, average = OPTIMIZERS[optimizer](parameters, 0.1), {name: value.clone() for name, value in model.state_dict().items()}
+        replay = TrainingReplay(model, parameters, rule, average, 1.0, batches[0], 10) if fast else None
         losses = norms = 0.0
         for step, windows in enumerate(batches):
             if replay:
@@ -151,7 +152,7 @@ def test_replayed_training_is_training(changes, settings, kinds, context):
             loss = model.loss(windows, generator, 0.0)
             loss.backward()
             losses, norms = losses + loss.item(), norms + torch.nn.utils.clip_grad_norm_(parameters, 1.0).item()
-            optimizer.step(1e-2 / (step + 1))
+            rule.step(1e-2 / (step + 1))
             for name, value in model.state_dict().items():
                 average[name].lerp_(value, 0.5)
         if replay:

@@ -11,11 +11,11 @@ import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from learn.dataset import DataSpec, Windows
-from learn.grid_emulator import NodeRoom, SparseGrid
+from learn.dataset import DataSettings, DataSpec, Windows
+from learn.grid_emulator import GridEmulator, NodeRoom, SparseGrid
 from learn.model import build
 from learn.replay import TrainingReplay
-from learn.train import OPTIMIZERS
+from learn.train import OPTIMIZERS, Config, Trainer, TrainSettings, train
 
 SETTINGS = {"channels": [16, 16], "frames_per_call": 3, "unroll": [2], "noise": 0.1}
 #: Water and sand beside kinematic particles, under a context; and in 3D.
@@ -59,6 +59,19 @@ def test_packing_by_hand():
     assert active.tolist() == [0, 1, 3, 6] and row.tolist() == [0, 1, 4, 2, 3, 4, 3] and room.most.tolist() == [4]
 
 
+def test_coarse_levels_count_what_finer_ones_have_no_room_for():
+    grid = SparseGrid([8, 8], 3)
+    inner = (torch.arange(1, 9)[:, None] * grid.stride0[0] + torch.arange(1, 9)).flatten()
+    room = NodeRoom([5, 3, 2], 1, torch.device("cpu"))
+    grid.occupy(inner, 1, room)
+    assert room.most.tolist() == [64, 16, 4]
+
+
+def test_room_is_at_most_what_the_grid_has():
+    model = build("grid_emulator", SETTINGS, spec_of())
+    assert model.make_room([10**6, 10], 3).capacity == [3 * 10**2, 10]  # 5 cells, 2 beyond each wall
+
+
 def test_tables_of_a_fixed_length_are_the_tables():
     grid = SparseGrid([7, 5], 2)
     inner = (torch.arange(1, 8)[:, None] * grid.stride0[0] + torch.arange(1, 6)).flatten()
@@ -74,6 +87,32 @@ def test_tables_of_a_fixed_length_are_the_tables():
         empty = torch.where(plain.neighbours == count, len(full.neighbours), plain.neighbours)
         assert torch.equal(full.neighbours[:count], empty)
     assert torch.equal(padded[0].child[: counts[0]], levels[0].child) and padded[0].coarse == 7
+
+
+def test_selected_windows_are_those_of_the_batch():
+    """Windows of different sizes and kinds, each with its context, in the batch's order; the one that leaves flight most is hardly ever left out."""
+    model = build("grid_emulator", SETTINGS | {"select": 2}, spec_of(particle_types=(3, 5), context_mean=(0.1,), context_std=(1.0,)))
+    windows = batch(6, (3, 5, 2, 4), 0, kinds=(3, 5), context=1)
+    flight = torch.arange(6)[:, None, None] * 0.01 + torch.arange(14)[:, None] * 0.02
+    windows.position[:] = flight
+    windows.position[3:, 8:10] += 0.1  # the third
+    generator, third = torch.Generator().manual_seed(0), 0
+    ends = [0, 3, 8, 10, 14]
+    for _ in range(50):
+        found = model.pick(windows, generator)
+        assert found.examples == 2 and found.example.diff().min() >= 0
+        chosen = []
+        for number in range(2):
+            own = found.position[:, found.example == number]
+            which = ends.index(round(float(own[0, 0, 0]) / 0.02))
+            part = slice(ends[which], ends[which + 1])
+            assert torch.equal(own, windows.position[:, part])
+            assert torch.equal(found.particle_type[found.example == number], windows.particle_type[part])
+            assert torch.equal(found.context[:, number], windows.context[:, which])
+            chosen.append(which)
+        assert chosen[0] < chosen[1]
+        third += 2 in chosen
+    assert third >= 45
 
 
 @pytest.mark.parametrize("optimizer", OPTIMIZERS)
@@ -173,6 +212,17 @@ def test_nothing_in_a_step_waits_for_the_device(case, optimizer):
     model = build("grid_emulator", SETTINGS | settings, spec_of(**changes))
     parameters, first = list(model.parameters()), batch(model.window(0.0), (18, 19, 14), 0, model.spec.dim, kinds, int("context_mean" in changes))
     replay = TrainingReplay(model, parameters, OPTIMIZERS[optimizer](parameters, 0.1), model.state_dict(), 1.0, first, 20)
+    # Nor does drawing wait for the step before, by reading something of it.
+    held = dict(model.named_buffers()) | dict(model.named_parameters())
+
+    def refuse(*arguments, **options):
+        raise AssertionError("read back while drawing")
+
+    for tensor in held.values():
+        tensor.to = tensor.cpu = tensor.numpy = tensor.tolist = refuse
+    model.noise(model.pick(first, torch.Generator().manual_seed(0)), torch.Generator().manual_seed(0))
+    for tensor in held.values():
+        del tensor.to, tensor.cpu, tensor.numpy, tensor.tolist
     captured, step = [], replay._step
 
     def capture():
@@ -183,3 +233,27 @@ def test_nothing_in_a_step_waits_for_the_device(case, optimizer):
     replay._step = capture
     replay.step(first, torch.Generator().manual_seed(0), 1e-2, 0.5)
     assert captured and replay.settle()[2:] == (0, 0)
+
+
+def test_trainings_end_where_plain_ones_do(bounce_dataset, tmp_path, monkeypatch):
+    """From windows of one call to those of two, validated between, resumed from the third step's checkpoint."""
+    settings = {"batch": 2, "log_every": 1, "validations": 2, "validation_frames": 6, "checkpoint_every": 3, "average_decay": 0.9}
+    chosen = TrainSettings(steps=6, optimizer="muon", learning_rate=1e-3, warmup_steps=1, **settings)
+    config = Config(model="grid_emulator", settings=SETTINGS | {"unroll": [1, 2], "select": 1}, training=chosen, data=DataSettings(mirror=True))
+    train(config, bounce_dataset, tmp_path / "plain", "here")
+    monkeypatch.setattr(GridEmulator, "replayable", True)
+    steps = Trainer._train_step
+
+    def dies(trainer, progress):
+        if trainer.step == 4:
+            raise LookupError
+        steps(trainer, progress)
+
+    with monkeypatch.context() as patch, pytest.raises(LookupError):
+        patch.setattr(Trainer, "_train_step", dies)
+        train(config, bounce_dataset, tmp_path / "replayed", "here")
+    train(config, bounce_dataset, tmp_path / "replayed", "here")
+    for name in ("log.csv", "validation.csv"):
+        plain, replayed = (np.genfromtxt(tmp_path / run / name, delimiter=",", names=True) for run in ("plain", "replayed"))
+        for column in set(plain.dtype.names) - {"seconds"}:
+            np.testing.assert_allclose(replayed[column], plain[column], rtol=1e-4)
