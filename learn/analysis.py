@@ -110,6 +110,14 @@ def speed_up_at_equal_error(rows: list[dict], model: dict, yardstick: Yardstick 
     return {"ratio": ratio, "rung": rung["contender"], "rung_kind": rung["kind"], "outcome": outcome}
 
 
+def speed_ups_of_seeds(rows: list[dict], model: dict, yardstick: Yardstick = MOVING_MSE) -> list[dict]:
+    """``speed_up_at_equal_error`` of each training by itself, by its own error and the time of the row; empty where there was one training."""
+    seeds = model["spread"]["per_seed"]
+    if len(seeds) < 2:
+        return []
+    return [speed_up_at_equal_error(rows, model | {yardstick.metric: seed[yardstick.metric]}, yardstick) for seed in seeds]
+
+
 def error_at_equal_time(rows: list[dict], model: dict, yardstick: Yardstick = MOVING_MSE) -> dict:
     """{"rung", "error", "ratio"}: the most accurate solver rung that costs at most the model's time, and the model's error over its error.
 
@@ -164,7 +172,8 @@ def analyse(rows: list[dict], yardstick: Yardstick = MOVING_MSE) -> list[dict]:
     """Everything above for every learned row, JSON-able. Break-even needs ``row["cost"]`` = {"generation_seconds", "training_seconds"}.
 
     It is reckoned per rollout of the test's length, against the rung of ``equal_error`` and against the reference; None where unknown, and for a
-    tie. ``equal_error_mean``: ``equal_error`` by means over the trajectories in place of medians, which a few bad rollouts do not move.
+    tie. ``equal_error_mean``: ``equal_error`` by means over the trajectories in place of medians, which a few bad rollouts do not move;
+    ``equal_error_seeds``: of each training by itself, where there are several.
     """
     result = []
     for model in (row for row in rows if row["kind"] == "learned"):
@@ -190,6 +199,7 @@ def analyse(rows: list[dict], yardstick: Yardstick = MOVING_MSE) -> list[dict]:
                 "speed_up_paper": paper,
                 "equal_error": equal,
                 "equal_error_mean": speed_up_at_equal_error(rows, model, means),
+                "equal_error_seeds": speed_ups_of_seeds(rows, model, yardstick),
                 "equal_time": error_at_equal_time(rows, model, yardstick),
                 "break_even": None if equal["outcome"] == "ties" else even(equal["ratio"]),
                 "break_even_reference": even(paper),
@@ -333,6 +343,7 @@ def _best_model(where: str, best: dict, by_name: dict[str, dict]) -> list[str]:
             match += " (it is the reference itself: no cheaper rung reaches that error)"
         sentences.append(f"{where}, {who}: {its}, {match}.")
         sentences += _by_the_mean(equal, best["equal_error_mean"])
+        sentences += _by_training(best["equal_error_seeds"])
     if best["speed_up_paper"] is not None:
         sentences.append(f"Against the reference, accuracy aside, {name} is {number(best['speed_up_paper'])} times as fast.")
     cost = row.get("cost")
@@ -362,6 +373,33 @@ def _by_the_mean(median: dict, mean: dict) -> list[str]:
         "failed": "it failed",
     }
     return [f"By the mean of the errors in place of their median, {said[mean['outcome']]}."]
+
+
+def _by_training(seeds: Sequence[dict]) -> list[str]:
+    """A sentence on the outcomes of repeated trainings; none where there was one."""
+    one = {
+        "wins": "wins",
+        "ties": "ties",
+        "loses": "loses",
+        "worse than trivial": "is worse than a trivial baseline",
+        "no rung": "has no rung to match",
+    }
+    several = {
+        "wins": "win",
+        "ties": "tie",
+        "loses": "lose",
+        "worse than trivial": "are worse than a trivial baseline",
+        "no rung": "have no rung to match",
+    }
+    parts = []
+    for outcome in one:
+        ratios = sorted(equal["ratio"] or math.inf for equal in seeds if equal["outcome"] == outcome)
+        if ratios:
+            by = f" ({', '.join(number(ratio) for ratio in ratios)})" if ratios[-1] < math.inf else ""
+            who = f"each of {len(seeds)}" if len(ratios) == len(seeds) else str(len(ratios))
+            verb = (several if 1 < len(ratios) < len(seeds) else one)[outcome]
+            parts.append(f"{who} {verb}{by}")
+    return [f"Trainings by themselves: {'; '.join(parts)}."] if parts else []
 
 
 def _headline(groups: dict[tuple[str, str], list[dict]], yardstick: Yardstick) -> list[str]:

@@ -286,8 +286,19 @@ def _ratio(equal: Mapping) -> _Cell:
     return _Cell(_DASH if equal["ratio"] is None else f"{number(equal['ratio'])}×", _OUTCOMES.get(equal["outcome"], equal["outcome"]))
 
 
+def _spread(seeds: Sequence[Mapping], table: _Table) -> _Cell:
+    """The smallest and the largest speed-up of several trainings over their outcomes."""
+    ratios = sorted(equal["ratio"] for equal in seeds if equal["ratio"] is not None)
+    if not ratios:
+        return table.missing("one training, or no rung as accurate")
+    ordered = sorted(seeds, key=lambda equal: equal["ratio"] or math.inf)
+    outcomes = dict.fromkeys(_OUTCOMES.get(equal["outcome"], equal["outcome"]) for equal in ordered)
+    return _Cell(f"{number(ratios[0])} to {number(ratios[-1])}×", ", ".join(outcomes))
+
+
 def _speed_ups(entries: Sequence[dict]) -> _Table:
     """What the learning bought, one row per learned contender."""
+    repeated = any(entry["equal_error_seeds"] for entry in entries)
     table = _Table(
         f"What the learning bought; error: {entries[0]['yardstick']}",
         [
@@ -295,6 +306,7 @@ def _speed_ups(entries: Sequence[dict]) -> _Table:
             "at equal error",
             "against",
             "in the mean",
+            *["each training"] * repeated,
             "model's error",
             "rung's error",
             "ratio",
@@ -302,7 +314,7 @@ def _speed_ups(entries: Sequence[dict]) -> _Table:
             "at equal error",
             "over the reference",
         ],
-        [("speed-up", 4), ("error at equal time", 4), ("break-even, rollouts", 2)],
+        [("speed-up", 4 + repeated), ("error at equal time", 4), ("break-even, rollouts", 2)],
     )
     for entry in entries:
         equal, mean, rival = entry["equal_error"], entry["equal_error_mean"], entry["equal_time"]
@@ -315,6 +327,7 @@ def _speed_ups(entries: Sequence[dict]) -> _Table:
             _ratio(equal),
             _Cell(equal["rung"] or _DASH),
             _ratio(mean),
+            *[_spread(entry["equal_error_seeds"], table)] * repeated,
             table.missing("some rollouts failed") if error is None else _Cell(number(error)),
             table.missing("no solver rung is as cheap") if rival["rung"] is None else _Cell(number(rival["error"])),
             table.missing(unrivalled) if rival["ratio"] is None else _Cell(f"{number(rival['ratio'])}×"),
@@ -387,7 +400,7 @@ def _glance(scenes: Sequence[dict], folder: str) -> _Table:
             speed[2],
             speed[3],
             table.missing("reference not timed") if best["speed_up_paper"] is None else speed[0],
-            table.missing("a tie, nothing is saved, or what data and training cost is unknown") if speed[8].text == _DASH else speed[8],
+            table.missing("a tie, nothing is saved, or what data and training cost is unknown") if speed[-2].text == _DASH else speed[-2],
         ]
         table.rows.append(_Row(scene["name"], cells, tag=tag, link=link))
     return table

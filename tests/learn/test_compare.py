@@ -250,6 +250,7 @@ def row(name, kind, error, seconds, spread=0.0, failures=0, **more):
         "rollout_mse_moving": {"20": None if error is None else error / 4, "all": error},
         "emd": {"0.5": 1.0, "1": 2.0},
         "mean": {"rollout_mse_moving": {"all": error}, "emd": {"1": 2.0}},
+        "spread": {"per_seed": []},
         "seconds_per_frame": seconds,
         "timing_spread": {"rounds": [seconds * (1 + spread * side) for side in (-1, 0, 1, 0, -1)], "n": 5},
         **more,
@@ -329,6 +330,20 @@ def test_every_round_must_agree_on_the_winner():
     assert outcome(0.5, 0.5, 0.5, 0.5, 4.0) == "wins"  # slow together: the ranges overlap, no round is lost
     assert outcome(0.5, 0.5, 0.5, 1.1, 0.5) == "ties"
     assert outcome(1.1, 1.1, 1.1, 1.1, 9.9) == "loses"
+
+
+def test_each_training_by_itself():
+    """Of three errors, 1e-3, 1e-5 and .1, a rung of time 1, one of 4 and one of .5 are the cheapest as accurate; the model takes .8."""
+    model = row("gns", "learned", 1e-3, 0.8)
+    model["spread"] = {"per_seed": [{"seed": k, "rollout_mse_moving": {"all": error}} for k, error in enumerate((1e-3, 1e-5, 0.1))]}
+    (result,) = a.analyse([*LADDER, model])
+    wanted = [a.speed_up_at_equal_error(LADDER, row("gns", "learned", error, 0.8)) for error in (1e-3, 1e-5, 0.1)]
+    assert result["equal_error_seeds"] == wanted and len({equal["rung"] for equal in wanted}) == 3
+    assert "Trainings by themselves: 2 win (1.2, 5); 1 loses (0.62)." in a.verdict([*LADDER, model])
+    model["spread"]["per_seed"][2] = model["spread"]["per_seed"][0]
+    assert "Trainings by themselves: each of 3 wins (1.2, 1.2, 5)." in a.verdict([*LADDER, model])
+    model["spread"]["per_seed"] = model["spread"]["per_seed"][:1]
+    assert a.analyse([*LADDER, model])[0]["equal_error_seeds"] == [] and "Trainings" not in a.verdict([*LADDER, model])
 
 
 def test_means_that_say_something_else():

@@ -294,6 +294,18 @@ def test_speed_ups_floor_and_costs(tmp_path, rows):
     assert cost["gns"][1:] == ["90 s", "10 min", "100"] and cost["contender"][-1] == "trajectories"
 
 
+def test_speed_ups_of_each_training(tmp_path, rows):
+    """The model of 3 ms errs by 4e-4, which a rung of 1 ms does as well; a second training by 1e-6, which takes the teacher's 9 ms."""
+    _, page = write(tmp_path, rows)
+    assert "each training" not in page.table("What the learning bought")["contender"]
+    seeds = [{"seed": seed, "rollout_mse_moving": {"all": error}} for seed, error in enumerate((4e-4, 1e-6))]
+    found = [row | ({"spread": row["spread"] | {"per_seed": seeds}} if row["contender"] == "gns" else {}) for row in rows]
+    _, page = write(tmp_path, found)
+    table = page.table("What the learning bought")
+    column = table["contender"].index("each training")
+    assert table["gns"][column] == "0.33 to 3× | loses, wins" and table["dead"][column].startswith("–^") and table["gns"][-2:] == ["never", "11,500"]
+
+
 def test_clouds(tmp_path, rows):
     _, page = write(tmp_path, rows)
     table = page.table("Clouds at")
