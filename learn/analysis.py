@@ -79,9 +79,13 @@ def speed_up_paper(rows: list[dict], model: dict) -> float | None:
     return references[0]["seconds_per_frame"] / model["seconds_per_frame"] if references and model["seconds_per_frame"] else None
 
 
-def speed_up_at_equal_error(rows: list[dict], model: dict, yardstick: Yardstick = MOVING_MSE) -> dict:
+#: A speed-up that a tenth more error takes away is the ladder's rather than the model's.
+SLACK = 0.1
+
+
+def speed_up_at_equal_error(rows: list[dict], model: dict, yardstick: Yardstick = MOVING_MSE, slack: float = 0.0) -> dict:
     """{"ratio", "rung", "rung_kind", "outcome"}: time of the cheapest solver rung, the reference included, that errs at most as the model
-    does, over the time of the model (of their medians). Above 1 the model is the cheaper one.
+    does, or by the share ``slack`` more, over the time of the model (of their medians). Above 1 the model is the cheaper one.
 
     Errors below the chaos floor mean nothing, so a rung need not be better than the floor. outcome: "wins" or "loses" where every round of
     the interleaved timing says so, else "ties"; "worse than trivial" where a trivial baseline errs less, whatever the ratio; "no rung" where
@@ -92,7 +96,7 @@ def speed_up_at_equal_error(rows: list[dict], model: dict, yardstick: Yardstick 
     if model["failures"] or error is None or model["seconds_per_frame"] is None:
         return nothing | {"outcome": "failed"}
     floor = _floor(rows, model)
-    allowed = max(error, (yardstick.of(floor) or 0.0) if floor else 0.0)
+    allowed = max(error * (1 + slack), (yardstick.of(floor) or 0.0) if floor else 0.0)
     enough = [row for row in _rungs(rows, model, yardstick) if yardstick.known(row) <= allowed]
     if not enough:
         return nothing | {"outcome": "no rung"}
@@ -173,7 +177,7 @@ def analyse(rows: list[dict], yardstick: Yardstick = MOVING_MSE) -> list[dict]:
 
     It is reckoned per rollout of the test's length, against the rung of ``equal_error`` and against the reference; None where unknown, and for a
     tie. ``equal_error_mean``: ``equal_error`` by means over the trajectories in place of medians, which a few bad rollouts do not move;
-    ``equal_error_seeds``: of each training by itself, where there are several.
+    ``equal_error_seeds``: of each training by itself, where there are several; ``equal_error_slack``: against rungs that err up to a tenth more.
     """
     result = []
     for model in (row for row in rows if row["kind"] == "learned"):
@@ -200,6 +204,7 @@ def analyse(rows: list[dict], yardstick: Yardstick = MOVING_MSE) -> list[dict]:
                 "equal_error": equal,
                 "equal_error_mean": speed_up_at_equal_error(rows, model, means),
                 "equal_error_seeds": speed_ups_of_seeds(rows, model, yardstick),
+                "equal_error_slack": speed_up_at_equal_error(rows, model, yardstick, SLACK),
                 "equal_time": error_at_equal_time(rows, model, yardstick),
                 "break_even": None if equal["outcome"] == "ties" else even(equal["ratio"]),
                 "break_even_reference": even(paper),
@@ -342,7 +347,8 @@ def _best_model(where: str, best: dict, by_name: dict[str, dict]) -> list[str]:
         if rung["kind"] == "reference":
             match += " (it is the reference itself: no cheaper rung reaches that error)"
         sentences.append(f"{where}, {who}: {its}, {match}.")
-        sentences += _by_the_mean(equal, best["equal_error_mean"])
+        sentences += _otherwise("By the mean of the errors in place of their median", equal, best["equal_error_mean"])
+        sentences += _otherwise("Beside rungs that err up to a tenth more", equal, best["equal_error_slack"])
         sentences += _by_training(best["equal_error_seeds"])
     if best["speed_up_paper"] is not None:
         sentences.append(f"Against the reference, accuracy aside, {name} is {number(best['speed_up_paper'])} times as fast.")
@@ -360,19 +366,19 @@ def _best_model(where: str, best: dict, by_name: dict[str, dict]) -> list[str]:
     return sentences
 
 
-def _by_the_mean(median: dict, mean: dict) -> list[str]:
-    """A sentence where the mean of the errors, which every bad rollout moves, says something else than their median."""
-    if mean["outcome"] == median["outcome"] and mean["ratio"] is not None and abs(math.log(mean["ratio"] / median["ratio"])) < 0.1:
+def _otherwise(how: str, equal: dict, other: dict) -> list[str]:
+    """A sentence where another measure than ``equal`` says something else."""
+    if other["outcome"] == equal["outcome"] and other["ratio"] is not None and abs(math.log(other["ratio"] / equal["ratio"])) < 0.1:
         return []
     said = {
-        "wins": f"it wins by {number(mean['ratio'] or 1)}",
+        "wins": f"it wins by {number(other['ratio'] or 1)}",
         "ties": "it ties",
-        "loses": f"the solver is {number(1 / (mean['ratio'] or 1))} times faster",
+        "loses": f"the solver is {number(1 / (other['ratio'] or 1))} times faster",
         "worse than trivial": "it is worse than a trivial baseline",
         "no rung": "no rung is as accurate",
         "failed": "it failed",
     }
-    return [f"By the mean of the errors in place of their median, {said[mean['outcome']]}."]
+    return [f"{how}, {said[other['outcome']]}."]
 
 
 def _by_training(seeds: Sequence[dict]) -> list[str]:

@@ -306,6 +306,7 @@ def _speed_ups(entries: Sequence[dict]) -> _Table:
             "at equal error",
             "against",
             "in the mean",
+            "a tenth more error",
             *["each training"] * repeated,
             "model's error",
             "rung's error",
@@ -314,7 +315,7 @@ def _speed_ups(entries: Sequence[dict]) -> _Table:
             "at equal error",
             "over the reference",
         ],
-        [("speed-up", 4 + repeated), ("error at equal time", 4), ("break-even, rollouts", 2)],
+        [("speed-up", 5 + repeated), ("error at equal time", 4), ("break-even, rollouts", 2)],
     )
     for entry in entries:
         equal, mean, rival = entry["equal_error"], entry["equal_error_mean"], entry["equal_time"]
@@ -327,6 +328,7 @@ def _speed_ups(entries: Sequence[dict]) -> _Table:
             _ratio(equal),
             _Cell(equal["rung"] or _DASH),
             _ratio(mean),
+            _ratio(entry["equal_error_slack"]),
             *[_spread(entry["equal_error_seeds"], table)] * repeated,
             table.missing("some rollouts failed") if error is None else _Cell(number(error)),
             table.missing("no solver rung is as cheap") if rival["rung"] is None else _Cell(number(rival["error"])),

@@ -332,6 +332,17 @@ def test_every_round_must_agree_on_the_winner():
     assert outcome(1.1, 1.1, 1.1, 1.1, 9.9) == "loses"
 
 
+def test_a_tenth_more_error():
+    """A rung that errs by 8 % more in a fourth of the time makes of 8 times 2; one by 11 % more nothing."""
+    model = row("gns", "learned", 1e-4, 0.5)
+    exact, near, far = row("exact", "solver", 9e-5, 4.0), row("near", "solver", 1.08e-4, 1.0), row("far", "solver", 1.11e-4, 0.1)
+    (result,) = a.analyse([TEACHER, exact, near, far, model])
+    assert (result["equal_error"]["ratio"], result["equal_error_slack"]["ratio"]) == (8.0, 2.0)
+    text = a.verdict([TEACHER, exact, near, far, model])
+    assert "gns wins at equal error, 8 times faster" in text and "Beside rungs that err up to a tenth more, it wins by 2." in text
+    assert "a tenth more" not in a.verdict([TEACHER, exact, far, model])
+
+
 def test_each_training_by_itself():
     """Of three errors, 1e-3, 1e-5 and .1, a rung of time 1, one of 4 and one of .5 are the cheapest as accurate; the model takes .8."""
     model = row("gns", "learned", 1e-3, 0.8)
