@@ -412,7 +412,7 @@ def _headline(groups: dict[tuple[str, str], list[dict]], yardstick: Yardstick) -
     """On how many of several scenes a learned model wins at equal error, which and by how much; how the others fall short."""
     scenes = [scene for scene, _ in groups]
     where: dict[str, list[str]] = {}
-    ratios: dict[str, list[tuple[float, str, str]]] = {}
+    ratios: dict[str, list[tuple[float, str, str, dict]]] = {}
     for (scene, reference), rows in groups.items():
         place = scene if scenes.count(scene) == 1 else f"{scene} (truth: {reference})"
         analysed = analyse(rows, yardstick)
@@ -420,14 +420,17 @@ def _headline(groups: dict[tuple[str, str], list[dict]], yardstick: Yardstick) -
         outcome = best["equal_error"]["outcome"] if best else "failed" if analysed else "none"
         where.setdefault(outcome, []).append(place)
         if best and best["equal_error"]["ratio"]:
-            ratios.setdefault(outcome, []).append((best["equal_error"]["ratio"], best["contender"], place))
-    wins = [f"{model} on {place}, {number(ratio)} times faster than the solver" for ratio, model, place in ratios.get("wins", [])]
+            ratios.setdefault(outcome, []).append((best["equal_error"]["ratio"], best["contender"], place, best["equal_error_slack"]))
+    wins = []
+    for ratio, model, place, slack in ratios.get("wins", []):
+        left = f" ({number(slack['ratio'])} beside rungs that err up to a tenth more)" if slack["ratio"] < 0.9 * ratio else ""
+        wins.append(f"{model} on {place}, {number(ratio)} times faster than the solver{left}")
     if wins:
         sentences = [f"At equal error ({yardstick}) a learned model wins on {len(wins)} of {len(groups)} scenes: {'; '.join(wins)}."]
     else:
         sentences = [f"No learned model wins at equal error ({yardstick}) on any of the {len(groups)} scenes."]
     if "loses" in where:
-        ratio, model, place = max(ratios["loses"])
+        ratio, model, place, _ = max(ratios["loses"], key=lambda lost: lost[0])
         lost = f"{len(where['loses'])} the solver is faster" if wins else f"{len(where['loses'])} the best loses to the solver"
         sentences.append(f"On {lost}, by the least on {place}, where {model} takes {number(1 / ratio)} times as long.")
     for outcome, text in (

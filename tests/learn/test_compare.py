@@ -341,6 +341,8 @@ def test_a_tenth_more_error():
     text = a.verdict([TEACHER, exact, near, far, model])
     assert "gns wins at equal error, 8 times faster" in text and "Beside rungs that err up to a tenth more, it wins by 2." in text
     assert "a tenth more" not in a.verdict([TEACHER, exact, far, model])
+    two = [row | {"scene": scene} for scene in ("sand", "goop") for row in (TEACHER, exact, *([near] if scene == "goop" else []), model)]
+    assert "gns on sand, 8 times faster than the solver; gns on goop, 8 times faster than the solver (2 beside rungs that err up" in a.verdict(two)
 
 
 def test_each_training_by_itself():
