@@ -14,6 +14,7 @@ import weakref
 import numpy as np
 import pytest
 import torch
+from replaying import assert_replayed_as_plain
 from textbook_gns import TextbookNetwork
 
 from learn import fused
@@ -135,35 +136,9 @@ def test_replayed_training_is_training(changes, settings, kinds, context, optimi
     """Three steps on batches of different sizes: the same losses, weights and averages as plain steps."""
     torch.manual_seed(0)
     plain = build("gns", SETTINGS | settings, spec_of(**changes))
-    replayed = copy.deepcopy(plain)
-    frames, found = plain.window(0.0), []
+    frames = plain.window(0.0)
     batches = [batch(frames, counts, seed, kinds, context) for seed, counts in enumerate([(8, 9), (10, 10), (4, 7)])]
-    for model, fast in ((plain, False), (replayed, True)):
-        parameters, generator = list(model.parameters()), torch.Generator().manual_seed(7)
-        rule, average = OPTIMIZERS[optimizer](parameters, 0.1), {name: value.clone() for name, value in model.state_dict().items()}
-        replay = TrainingReplay(model, parameters, rule, average, 1.0, batches[0], 10) if fast else None
-        losses = norms = 0.0
-        for step, windows in enumerate(batches):
-            if replay:
-                replay.step(windows, generator, 1e-2 / (step + 1), 0.5)
-                continue
-            for parameter in parameters:
-                parameter.grad = None
-            loss = model.loss(windows, generator, 0.0)
-            loss.backward()
-            losses, norms = losses + loss.item(), norms + torch.nn.utils.clip_grad_norm_(parameters, 1.0).item()
-            rule.step(1e-2 / (step + 1))
-            for name, value in model.state_dict().items():
-                average[name].lerp_(value, 0.5)
-        if replay:
-            losses, norms, *none = replay.settle()
-            assert none == [0, 0] and replay.settle() == (0.0, 0.0, 0, 0)
-        found.append((losses, norms, model.state_dict(), average))
-    (losses, norms, weights, average), (fast_losses, fast_norms, fast_weights, fast_average) = found
-    assert fast_losses == pytest.approx(losses, rel=1e-4) and fast_norms == pytest.approx(norms, rel=1e-4)
-    for name in weights:
-        torch.testing.assert_close(fast_weights[name], weights[name], rtol=1e-3, atol=2e-5)
-        torch.testing.assert_close(fast_average[name], average[name], rtol=1e-3, atol=2e-5)
+    assert_replayed_as_plain(plain, batches, 10, optimizer, rel=1e-4)
 
 
 def test_a_batch_without_edges_trains():

@@ -9,6 +9,7 @@ import copy
 import numpy as np
 import pytest
 import torch
+from replaying import assert_replayed_as_plain
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from learn.dataset import DataSettings, DataSpec, Windows
@@ -123,37 +124,11 @@ def test_replayed_training_is_training(case, optimizer):
     torch.manual_seed(0)
     plain = build("grid_emulator", SETTINGS | settings, spec_of(**changes))
     torch.nn.init.normal_(plain.network.leave.weight, std=0.05)
-    replayed, found = copy.deepcopy(plain), []
     batches = [
         batch(plain.window(0.0), counts, seed, plain.spec.dim, kinds, int("context_mean" in changes))
         for seed, counts in enumerate([(18, 19, 14), (20, 20, 20), (14, 17, 2)])
     ]
-    for model, fast in ((plain, False), (replayed, True)):
-        parameters, generator = list(model.parameters()), torch.Generator().manual_seed(7)
-        steps, average = OPTIMIZERS[optimizer](parameters, 0.1), {name: value.clone() for name, value in model.state_dict().items()}
-        replay = TrainingReplay(model, parameters, steps, average, 1.0, batches[0], 20) if fast else None
-        losses = norms = 0.0
-        for step, windows in enumerate(batches):
-            if replay:
-                replay.step(windows, generator, 1e-2 / (step + 1), 0.5)
-                continue
-            for parameter in parameters:
-                parameter.grad = None
-            loss = model.loss(windows, generator, 0.0)
-            loss.backward()
-            losses, norms = losses + loss.item(), norms + torch.nn.utils.clip_grad_norm_(parameters, 1.0).item()
-            steps.step(1e-2 / (step + 1))
-            for name, value in model.state_dict().items():
-                average[name].lerp_(value, 0.5)
-        if replay:
-            losses, norms, *none = replay.settle()
-            assert none == [0, 0] and model.room is None
-        found.append((losses, norms, model.state_dict(), average))
-    (losses, norms, weights, average), (fast_losses, fast_norms, fast_weights, fast_average) = found
-    assert losses > 1e-3 and fast_losses == pytest.approx(losses, rel=1e-5) and fast_norms == pytest.approx(norms, rel=1e-4)
-    for name in weights:
-        torch.testing.assert_close(fast_weights[name], weights[name], rtol=1e-3, atol=2e-5)
-        torch.testing.assert_close(fast_average[name], average[name], rtol=1e-3, atol=2e-5)
+    assert assert_replayed_as_plain(plain, batches, 20, optimizer, rel=1e-5) > 1e-3
 
 
 @pytest.mark.parametrize("optimizer", OPTIMIZERS)
